@@ -1,0 +1,31 @@
+"""modgnn_rl: imitation and reinforcement learning of robot swarms with ModGNN, on TorchRL.
+
+The names below are imported when they are first used, so that ``python -m modgnn_rl.train --help`` need not wait for
+torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from modgnn_rl.loading import load_policy
+    from modgnn_rl.models import make_model
+    from modgnn_rl.modgnn import ModGNN, ModGNNLayer
+
+__version__ = "0.1.0"
+__all__ = ["ModGNN", "ModGNNLayer", "__version__", "load_policy", "make_model"]
+
+_HOMES = {
+    "ModGNN": "modgnn_rl.modgnn",
+    "ModGNNLayer": "modgnn_rl.modgnn",
+    "load_policy": "modgnn_rl.loading",
+    "make_model": "modgnn_rl.models",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)
