@@ -1,0 +1,180 @@
+"""Every setting of modgnn_rl: one dataclass a configuration group, each field with its documentation and range.
+
+This module imports neither torch nor TorchRL, so that the commands can refuse a bad setting at once.
+Values that differ from these defaults stand in the YAML files beside this module, one file a choice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from omegaconf import MISSING
+
+from modgnn_rl.settings import setting
+
+__all__ = [
+    "BCConfig",
+    "DAggerConfig",
+    "EvaluateConfig",
+    "EvaluationConfig",
+    "FlockingConfig",
+    "ImitationConfig",
+    "LoggerConfig",
+    "ModelConfig",
+    "TrainConfig",
+]
+
+
+@dataclass
+class FlockingConfig:
+    """The world: flocks of quadcopters behind a leader, and the rule that their expert flies by.
+
+    The defaults are the well-posed preset S1; ``env=paper`` is the preset nearest to the paper (R).
+    """
+
+    num_agents: Any = setting(32, "agents in a flock, the leader included; a list trains on several sizes at once", low=1)
+    comm_range: float = setting(3.5, "distance within which agents hear each other, m", above=0)
+    max_steps: int = setting(1000, "control steps after which an episode is truncated", low=1)
+    max_speed: float = setting(0.92, "target velocities are projected onto the ball of this radius, m/s", above=0)
+
+    cohesion_gain: float = setting(0.06, "expert: weight C_c of the Reynolds cohesion term", low=0)
+    separation_gain: float = setting(0.8, "expert: weight C_s of the Reynolds separation term", low=0)
+    alignment_gain: float = setting(0.02, "expert: weight C_a of the Reynolds alignment term", low=0)
+
+    start_radius: float = setting(4.0, "radius of the starting ball of 32 agents, m; it scales with (N / 32)^(1/3)", above=0)
+    start_distance: float = setting(0.3, "smallest distance between two agents at the start, m", low=0)
+    leader_noise: float = setting(0.10, "leader: its target velocity gains N(0, leader_noise^2 dt) each step, m/s^1.5", low=0)
+    leader_max_speed: float = setting(0.8, "leader: its target velocity is kept in the ball of this radius, m/s", above=0)
+
+    physics: str = setting("torch", "physics engine", choices=("torch",))
+    control_frequency: float = setting(48.0, "control steps a second, Hz", above=0)
+    physics_substeps: int = setting(5, "physics steps in a control step (5 x 48 Hz = 240 Hz)", low=1)
+    velocity_gain: float = setting(1.0, "velocity controller: proportional gain k_p, 1/s", above=0)
+
+    max_distance: float = setting(
+        30.0, "a flock has diverged when an agent is farther than this from its centre of mass, m", above=0
+    )
+    collision_distance: float = setting(
+        0.08, "two agents closer than this touch (twice the rotor arm), m; costs reward", low=0
+    )
+    max_colliding: float = setting(
+        0.5, "a flock has collided beyond use when more than this share of its agents touch another", above=0, high=1
+    )
+
+    @property
+    def sizes(self) -> list[int]:
+        """``num_agents`` as a list."""
+        return [self.num_agents] if isinstance(self.num_agents, int) else list(self.num_agents)
+
+
+@dataclass
+class ModelConfig:
+    """The policy: one of the models of `modgnn_rl.models`."""
+
+    name: str = setting("pair_force", "model", choices=("pair_force", "modgnn_mlp", "gcn"))
+    hops: int = setting(1, "communication hops K", low=0)
+    hidden: int = setting(32, "width of the hidden layers", low=1)
+
+
+@dataclass
+class ImitationConfig:
+    """What behaviour cloning and DAgger share: how flights become data, and data become a policy."""
+
+    name: str = setting(MISSING, "trainer", choices=("bc", "dagger"))
+    num_envs: int = setting(
+        64, "flocks of 32 agents flown at once; other sizes get as many agents, shared between the sizes", low=1
+    )
+    every: int = setting(2, "of the steps flown, each how-manyth becomes data", low=1)
+    capacity: int = setting(16_000, "flock states kept for each size; the oldest go first", low=1)
+    batch_size: int = setting(256, "flock states in a batch", low=1)
+    receivers: int = setting(
+        8, "agents of a state of 32 whose error counts in an update; at other sizes N, as many links: 32 / N times", low=1
+    )
+    learning_rates: list[float] = setting(
+        [3e-3, 1e-3, 1e-4], "Adam: at the start, after the cloning updates, at the end; cosines between", above=0
+    )
+    averaging: float = setting(0.99, "decay of the moving average of the weights, which is what flies", low=0, high=1)
+    max_gradient: float = setting(1.0, "gradients are clipped to this norm", above=0)
+    rotate: bool = setting(True, "turn each state of a batch by a random rotation")
+    checkpoint_minutes: float = setting(1.0, "time between two checkpoints, min", low=0)
+
+
+@dataclass
+class BCConfig(ImitationConfig):
+    """Behaviour cloning: fit the expert on the expert's own flights."""
+
+    name: str = setting("bc", "trainer", choices=("bc",))
+    capacity: int = setting(32_000, "flock states kept for each size; the oldest go first", low=1)
+    cloning_steps: int = setting(1000, "steps that the expert flies", low=1)
+    cloning_updates: int = setting(4000, "updates on its flights, for each size", low=1)
+    held_out: int = setting(8, "flocks whose flights are kept for the validation error", low=1)
+
+
+@dataclass
+class DAggerConfig(ImitationConfig):
+    """DAgger: clone the expert a little, then fly, ask the expert, aggregate and fit, round by round."""
+
+    name: str = setting("dagger", "trainer", choices=("dagger",))
+    cloning_steps: int = setting(200, "steps that the expert flies at first", low=1)
+    cloning_updates: int = setting(100, "updates on its flights, for each size", low=0)
+    rounds: int = setting(84, "rounds of flying and fitting", low=0)
+    round_steps: int = setting(40, "steps flown in a round", low=1)
+    round_updates: int = setting(20, "updates in a round, for each size", low=1)
+    schedule: str = setting(
+        "exponential", "how the expert's share of the flying time falls", choices=("constant", "linear", "exponential")
+    )
+    expert_share: float = setting(0.6, "the expert's share in the first round", low=0, high=1)
+    share_decay: float = setting(0.6, "exponential schedule: factor between two rounds", low=0, high=1)
+    expert_rounds: int = setting(13, "round from which on the policy flies alone", low=0)
+    stretch: int = setting(40, "steps that the one who flies a flock keeps it", low=1)
+
+
+@dataclass
+class LoggerConfig:
+    """Where the metrics go besides the plain files, which are always written."""
+
+    name: str = setting("none", "dashboard to write for", choices=("none", "csv", "tensorboard", "wandb"))
+    project: str = setting("modgnn_rl", "project in Weights & Biases")
+    mode: str = setting(
+        "offline", "whether Weights & Biases sends the run while it trains", choices=("offline", "online", "disabled")
+    )
+    init_timeout: float = setting(
+        10.0, "longest wait for the Weights & Biases server at the start and at the end, s", above=0, high=15
+    )
+
+
+@dataclass
+class EvaluationConfig:
+    """Flights that tell how good a policy is."""
+
+    num_flocks: int = setting(100, "fresh flocks that each policy flies", low=2)
+    num_agents: Any = setting(None, "agents in a flock, or a list of sizes; null: as in training", low=1)
+    steps: int = setting(1000, "steps of a flight", low=4)
+    seed: int = setting(1_000_000, "seed of starts and leaders, apart from those of training", low=0)
+
+
+@dataclass
+class TrainConfig:
+    """A training run."""
+
+    env: FlockingConfig = field(default_factory=FlockingConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    trainer: Any = MISSING
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    seed: int = setting(0, "fixes everything that is drawn", low=0)
+    device: str = setting("cpu", "where to train: cpu, cuda, cuda:1")
+    threads: int = setting(0, "threads of torch on the CPU; 0: one for each core", low=0)
+    runs: str = setting("runs", "folder for the run folders")
+    name: str | None = setting(None, "name of the run; null: trainer and model")
+
+
+@dataclass
+class EvaluateConfig:
+    """Evaluation of a finished run."""
+
+    run: str = setting(MISSING, "run folder")
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
+    threads: int = setting(0, "threads of torch on the CPU; 0: one for each core", low=0)

@@ -1,0 +1,300 @@
+"""What every ``python -m modgnn_rl.<command>`` shares: its configuration, its help and its error messages.
+
+A command is a function of one dataclass::
+
+    def main(config: TrainConfig) -> None:
+        \"\"\"Train a flock.\"\"\"
+        from modgnn_rl.training import train  # heavy imports only now: a typing error must be reported at once
+
+        train(config)
+
+
+    if __name__ == "__main__":
+        run_command(main, TrainConfig, "train", nodes={"trainer/dagger": DaggerConfig})
+
+Hydra composes the configuration from ``configs/``; nothing is written and the working directory is kept. Whatever
+the user can mend is one line on stderr and exit code 2; a bug keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import re
+import sys
+import tempfile
+import textwrap
+import typing
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeVar
+
+import hydra
+import yaml
+from hydra._internal.utils import get_args_parser
+from hydra.conf import HelpConf, HydraConf, JobConf, RunDir, SweepDir
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+)
+
+from modgnn_rl.errors import InputError
+from modgnn_rl.settings import check, suggestion
+
+__all__ = ["run_command"]
+
+Config = TypeVar("Config")
+
+FLAGS = """\
+  --multirun           one run for every combination of comma-separated values, as in seed=0,1,2
+  --config-dir DIR     also look for choices in DIR, for example DIR/trainer/mine.yaml for trainer=mine
+  --cfg job            print the resolved configuration and stop
+  --help               this text, for the choices and settings given beside it"""
+
+# What Hydra raises for a command line or a YAML file that the user can mend, as long as no job has begun.
+USER_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, UserWarning, ValueError)
+
+
+def run_command(
+    main: Callable[[Config], int | None],
+    schema: type[Config],
+    name: str,
+    *,
+    nodes: Mapping[str, type] | None = None,
+    config_path: str = "pkg://modgnn_rl.configs",
+) -> None:
+    """Compose the configuration that the command line asks for and call ``main`` with it.
+
+    The folder behind ``config_path`` holds ``<name>.yaml``, whose defaults list begins with ``<name>_schema``, and one
+    folder of YAML files for each group. A group whose choices have different settings types its files through
+    ``nodes``: the entry ``"trainer/dagger"`` is listed in ``trainer/dagger.yaml`` as ``/trainer_dagger_schema@_here_``.
+
+    Args:
+        main: the command; its docstring heads the help, its return value is the exit code (``None`` counts as 0).
+        schema: dataclass of the whole configuration, declared with `modgnn_rl.settings.setting`.
+        name: name of the command and of its YAML file.
+        nodes: dataclasses of single choices, by ``"group/choice"``.
+        config_path: where Hydra looks for the YAML files.
+
+    Raises:
+        SystemExit: with code 2 after an error that the user can mend, 130 after Ctrl-C, or the code of ``main``.
+    """
+    nodes = nodes or {}
+    known = [*_dotted(schema), *(f"{k.split('/')[0]}.{key}" for k, node in nodes.items() for key in _dotted(node))]
+    codes: list[int] = []
+    job_began = False
+
+    def job_for(act: Callable[[Config], int | None]) -> Callable[[DictConfig], None]:
+        def job(config: DictConfig) -> None:
+            nonlocal job_began
+            job_began = True
+            try:
+                codes.append(act(_settings(config, schema, name, known)) or 0)
+            except InputError as error:
+                # SystemExit passes through Hydra without the lines that Hydra adds to a failed job.
+                raise SystemExit(_report(str(error))) from error
+
+        return job
+
+    # Hydra's own error messages run over several lines; with this set it raises what happened instead.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    flags = _flags()
+    # All jobs of a multirun are checked before the first begins, unless the user brings a launcher or a sweeper.
+    rehearse = flags.multirun and not any(override.startswith("hydra/") for override in flags.overrides)
+    # A multirun writes its multirun.yaml whatever the settings say; our run folders hold all that it says.
+    with tempfile.TemporaryDirectory(prefix="modgnn_rl-") as scratch:
+        _register(main, schema, name, nodes, scratch)
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("error", message="provider=.* is not available")
+                for act in [lambda _: 0, main] if rehearse else [main]:
+                    hydra.main(version_base="1.3", config_path=config_path, config_name=name)(job_for(act))()
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            sys.exit(130)
+        except USER_ERRORS as error:
+            if job_began:
+                raise
+            sys.exit(_report(_explain(error, known)))
+    if any(codes):
+        sys.exit(max(codes))
+
+
+def _report(message: str) -> int:
+    """Print one error line; return the exit code that goes with it."""
+    print("error:", " ".join(message.split()), file=sys.stderr)
+    return 2
+
+
+def _flags() -> argparse.Namespace:
+    """Parse the command line as Hydra will; report a flag it does not know in one line, without argparse's usage."""
+    output = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(output):
+            return get_args_parser().parse_args()
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        reason = output.getvalue().rpartition("error: ")[2]
+        sys.exit(_report(f"{reason.strip()}; flags stand before or after all settings, and --help lists them"))
+
+
+def _register(main: Callable[..., Any], schema: type, name: str, nodes: Mapping[str, type], sweep_folder: str) -> None:
+    """Give Hydra the dataclasses, and defaults under which it writes nothing."""
+    store = ConfigStore.instance()
+    store.store(name=f"{name}_schema", node=schema)
+    for key, node in nodes.items():
+        store.store(name=f"{key.replace('/', '_')}_schema", node=node)
+    quiet = {"hydra_logging": "none", "job_logging": "none"}
+    defaults = [{**entry, **{key: quiet[key] for key in entry if key in quiet}} for entry in HydraConf().defaults]
+    conf = HydraConf(
+        defaults=[*defaults, "_self_"],
+        run=RunDir("."),
+        sweep=SweepDir(sweep_folder, "."),
+        output_subdir=None,
+        job=JobConf(name=name),
+        help=HelpConf(app_name=name, header="", footer="", template="${modgnn_rl_help:}"),
+    )
+    store.store(group="hydra", name="config", node=conf)
+    OmegaConf.register_new_resolver(
+        "modgnn_rl_help", lambda *, _root_: _help(main, name, _root_).replace("$", "$$"), replace=True
+    )
+
+
+def _settings(config: DictConfig, schema: type[Config], name: str, known: list[str]) -> Config:
+    """Turn a composed configuration into its dataclass and check it.
+
+    Raises:
+        InputError: an unknown setting, one that is missing, or one out of range.
+    """
+    if not (isinstance(kind := OmegaConf.get_type(config), type) and issubclass(kind, schema)):
+        raise InputError(f"the configuration has no types: its defaults list must begin with {name}_schema")
+    # +key=value and ~key change a configuration without asking its dataclass.
+    for key, is_known in _changed(config):
+        raise InputError(f"{key} cannot be taken away" if is_known else _unknown_setting(key, known))
+    try:
+        settings = OmegaConf.to_object(config)
+    except OmegaConfBaseException as error:
+        raise InputError(_explain(error, known)) from error
+    check(settings)
+    return typing.cast(Config, settings)
+
+
+def _children(config: DictConfig) -> Iterator[tuple[str, DictConfig]]:
+    """Yield the nodes of a configuration that have settings of their own."""
+    for key in map(str, config):
+        if OmegaConf.is_missing(config, key) or OmegaConf.is_interpolation(config, key):
+            continue
+        if isinstance(child := config[key], DictConfig) and dataclasses.is_dataclass(OmegaConf.get_type(child)):
+            yield key, child
+
+
+def _fields(config: DictConfig) -> tuple[dataclasses.Field[Any], ...]:
+    """Return the fields of the dataclass behind a configuration."""
+    return dataclasses.fields(typing.cast(type, OmegaConf.get_type(config)))
+
+
+def _changed(config: DictConfig, prefix: str = "") -> Iterator[tuple[str, bool]]:
+    """Yield each dotted key that the configuration has or its dataclasses have, but not both; true for the latter."""
+    fields = {field.name for field in _fields(config)}
+    for key in fields ^ set(map(str, config)):
+        yield f"{prefix}{key}", key in fields
+    for key, child in _children(config):
+        yield from _changed(child, f"{prefix}{key}.")
+
+
+def _dotted(schema: type, prefix: str = "") -> Iterator[str]:
+    """Yield the dotted key of every setting of a dataclass."""
+    hints = typing.get_type_hints(schema)
+    for field in dataclasses.fields(schema):
+        yield prefix + field.name
+        if dataclasses.is_dataclass(hint := hints[field.name]):
+            yield from _dotted(typing.cast(type, hint), f"{prefix}{field.name}.")
+
+
+def _unknown_setting(key: str, known: list[str]) -> str:
+    """Say that a setting does not exist, and which was probably meant."""
+    leaf = key.rpartition(".")[2]
+    same_leaf = next((setting for setting in known if setting.rpartition(".")[2] == leaf and setting != key), None)
+    hint = f"; did you mean '{same_leaf}'?" if same_leaf else suggestion(key, known)
+    return f"unknown setting {key}{hint or '; --help lists them all'}"
+
+
+def _explain(error: BaseException, known: list[str]) -> str:
+    """Put an error of Hydra, OmegaConf or YAML in the words of the command line."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        group, _, choice = error.missing_cfg_file.rpartition("/")
+        if error.options:
+            return f"{group}={choice} is not one of {', '.join(error.options)}{suggestion(choice, error.options)}"
+        return f"there is no configuration {error.missing_cfg_file}.yaml where configurations are looked for"
+    if isinstance(error, OverrideParseException):
+        return f"cannot read '{error.override}': {error.message.splitlines()[0]}; expected key=value"
+    cause = error if isinstance(error, OmegaConfBaseException) else error.__cause__ or error.__context__
+    if not isinstance(cause, OmegaConfBaseException):
+        return str(error) or type(error).__name__
+    file = re.match(r"In '[^']*': ", str(error))
+    return (file[0] if file else "") + _explain_value(cause, known)
+
+
+def _explain_value(error: OmegaConfBaseException, known: list[str]) -> str:
+    """Put what OmegaConf has against one value in the words of the command line."""
+    key = error.full_key or str(error.key)
+    if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
+        return _unknown_setting(key, known)
+    if isinstance(error, MissingMandatoryValue):
+        return f"{key} must be given, as in {key}=..."
+    reason = str(error.msg or error).splitlines()[0]
+    return f"{key}: {reason}" if error.full_key else reason
+
+
+def _help(main: Callable[..., Any], name: str, config: DictConfig) -> str:
+    """Return the help text for a composed configuration: its groups, and every setting with its doc and range."""
+    loader = GlobalHydra.instance().config_loader()
+    chosen = config.hydra.runtime.choices
+    lines = [f"python -m modgnn_rl.{name} [group=choice ...] [setting=value ...] [flags]", ""]
+    lines += [*(main.__doc__ or "").strip().splitlines()[:1], "", "Choices (in use: *)"]
+    for group in sorted(set(loader.list_groups("")) - {"hydra"}):
+        options = loader.get_group_options(group, ObjectType.CONFIG)
+        if options:
+            lines.append(f"  {group}=" + ", ".join(f"{o}*" if chosen.get(group) == o else o for o in options))
+    lines += ["", "Settings, with the values they have under these choices", *_setting_lines(config)]
+    return "\n".join([*lines, "", "Flags", FLAGS])
+
+
+def _setting_lines(config: DictConfig, prefix: str = "") -> Iterator[str]:
+    """Yield the help on every setting of a configuration, nested ones after those of the node itself."""
+    raw = OmegaConf.to_container(config, resolve=False)
+    fields = _fields(config)
+    children = dict(_children(config))
+    nested = {field.name: children[field.name] for field in fields if field.name in children}
+    for field in fields:
+        if field.name not in nested:
+            value = typing.cast(dict[str, Any], raw)[field.name]
+            shown = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+            head = f"  {prefix}{field.name}={'<required>' if value == '???' else shown}"
+            text = f"{field.metadata.get('doc', '')}{_range(field.metadata)}"
+            indent = " " * 40
+            body = textwrap.fill(text, 120, initial_indent=indent, subsequent_indent=indent)
+            yield head + body[len(head) :] if len(head) < len(indent) - 1 else f"{head}\n{body}".rstrip()
+    for key, child in nested.items():
+        yield from _setting_lines(child, f"{prefix}{key}.")
+
+
+def _range(rule: Mapping[str, Any]) -> str:
+    """Return the legal values of a setting in brackets, or an empty string."""
+    if rule.get("choices"):
+        return f" [{', '.join(map(str, rule['choices']))}]"
+    words = {"low": "at least", "above": "greater than", "high": "at most"}
+    bounds = [f"{word} {rule[key]}" for key, word in words.items() if rule.get(key) is not None]
+    return f" [{', '.join(bounds)}]" if bounds else ""

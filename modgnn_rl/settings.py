@@ -1,0 +1,96 @@
+"""Settings: dataclass fields that carry their own documentation and range.
+
+A setting is declared once, in a dataclass beside the code it configures::
+
+    @dataclass
+    class FlockingConfig:
+        comm_range: float = setting(3.5, "distance within which agents hear each other, m", above=0)
+
+:func:`check` then holds any such dataclass (nested ones too) against the declared ranges, both for the command
+line and for people who build the objects in Python.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from modgnn_rl.errors import InputError
+
+__all__ = ["check", "setting", "suggestion"]
+
+
+def setting(
+    default: Any,
+    doc: str,
+    *,
+    low: float | None = None,
+    above: float | None = None,
+    high: float | None = None,
+    choices: Iterable[Any] | None = None,
+) -> Any:
+    """Declare a dataclass field with its documentation and its legal values.
+
+    Args:
+        default: default value; lists are copied for each instance.
+        doc: one line that says what the setting does, with its unit.
+        low: smallest legal value.
+        above: exclusive lower bound.
+        high: largest legal value.
+        choices: the legal values, where they can be listed.
+    """
+    metadata: dict[str, Any] = {"doc": doc, "low": low, "above": above, "high": high}
+    metadata["choices"] = None if choices is None else tuple(choices)
+    if isinstance(default, list):
+        return dataclasses.field(default_factory=lambda: copy.copy(default), metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def check(config: Any, path: str = "") -> None:
+    """Hold every setting of a dataclass against its declared range.
+
+    Args:
+        config: a dataclass instance whose fields were declared with :func:`setting`; nested dataclasses are followed.
+        path: how the user addresses ``config`` on the command line, for example ``env``.
+
+    Raises:
+        InputError: the first setting that is out of range, with what was expected.
+    """
+    for field in dataclasses.fields(config):
+        name = f"{path}.{field.name}" if path else field.name
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            check(value, name)
+        elif "doc" in field.metadata:
+            for item in value if isinstance(value, (list, tuple)) else [value]:
+                _check_value(name, item, field.metadata)
+
+
+def _check_value(name: str, value: Any, rule: Any) -> None:
+    """Raise InputError unless one value obeys the metadata written by `setting`."""
+    choices = rule["choices"]
+    if choices is not None and value not in choices:
+        hint = suggestion(str(value), [str(choice) for choice in choices])
+        raise InputError(f"{name}={value} is not one of {', '.join(map(str, choices))}{hint}")
+    if value is None or isinstance(value, (str, bool)) or not isinstance(value, (int, float)):
+        return
+    if math.isnan(value):
+        raise InputError(f"{name} is not a number; expected {rule['doc']}")
+    bounds = (
+        (rule["low"] is not None and value < rule["low"], f"at least {rule['low']}"),
+        (rule["above"] is not None and value <= rule["above"], f"greater than {rule['above']}"),
+        (rule["high"] is not None and value > rule["high"], f"at most {rule['high']}"),
+    )
+    for broken, expected in bounds:
+        if broken:
+            raise InputError(f"{name}={value} is out of range: it must be {expected} ({rule['doc']})")
+
+
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """Return ``"; did you mean 'x'?"`` for the known word nearest to ``word``, or an empty string."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""
