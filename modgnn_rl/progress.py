@@ -1,0 +1,106 @@
+"""One progress display for training and evaluation."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, TextIO
+
+from tqdm import tqdm
+
+__all__ = ["Progress"]
+
+_LIVE = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}{postfix} [{rate_fmt}, {remaining} left]"
+_PLAIN = "{desc}: {percentage:3.0f}% {n_fmt}/{total_fmt}{postfix} [{rate_fmt}, {elapsed} passed, {remaining} left]"
+
+
+class Progress:
+    """A live bar on a terminal, a plain line now and then elsewhere, and always a last line.
+
+    Example::
+
+        with Progress("dagger", total=84 * 4096) as progress:
+            for number in range(84):
+                ...
+                progress.update(4096, round=f"{number + 1}/84", error=error)
+
+    Args:
+        description: what is going on, at the start of the line.
+        total: how many units there are to do.
+        unit: what is counted; the rate is given in units per second.
+        every: smallest time between two plain lines, s.
+        stream: where to write; the standard error stream where left out.
+        clock: the time in s, for plain lines.
+    """
+
+    def __init__(
+        self,
+        description: str,
+        total: int,
+        *,
+        unit: str = "flock-steps",
+        every: float = 10.0,
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.description, self.total, self.unit = description, total, f" {unit}"
+        self.done = 0
+        self.figures: dict[str, str] = {}
+        self._stream = sys.stderr if stream is None else stream
+        self._every, self._clock = every, clock
+        self._bar: tqdm[Any] | None = None
+
+    def __enter__(self) -> Progress:
+        """Start the clock and show the first bar."""
+        self._start = self._last = self._clock()
+        if self._stream.isatty():
+            self._bar = tqdm(
+                desc=self.description,
+                total=self.total,
+                unit=self.unit,
+                unit_scale=True,
+                bar_format=_LIVE,
+                dynamic_ncols=True,
+                file=self._stream,
+            )
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Leave the last state on the screen."""
+        if self._bar is not None:
+            self._bar.close()
+        else:
+            self._write_line()
+
+    def update(self, n: int = 0, **figures: float | str) -> None:
+        """Count ``n`` more units as done, and show these figures from now on.
+
+        Args:
+            n: how many units were done since the last call.
+            **figures: numbers (shown with three digits) and texts by name; others keep their last value.
+        """
+        self.done += n
+        self.figures |= {key: value if isinstance(value, str) else f"{value:.3g}" for key, value in figures.items()}
+        if self._bar is not None:
+            self._bar.set_postfix_str(self._postfix(), refresh=False)
+            self._bar.update(n)
+        elif self._clock() - self._last >= self._every:
+            self._write_line()
+
+    def _postfix(self) -> str:
+        return ", ".join(f"{key} {value}" for key, value in self.figures.items())
+
+    def _write_line(self) -> None:
+        self._last = self._clock()
+        line = tqdm.format_meter(
+            self.done,
+            self.total,
+            self._last - self._start,
+            prefix=self.description,
+            unit=self.unit,
+            unit_scale=True,
+            postfix=self._postfix(),
+            bar_format=_PLAIN,
+        )
+        print(line, file=self._stream, flush=True)

@@ -1,0 +1,168 @@
+"""The folder that holds all of one run: configuration, metrics, checkpoints, tables."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from modgnn_rl.errors import InputError
+from modgnn_rl.files import write_atomically
+
+__all__ = ["SCHEMA_VERSION", "RunFolder"]
+
+SCHEMA_VERSION = 1
+
+_HEADER = (
+    "# The configuration of this run, all defaults written out. Commands that continue or evaluate the run read it.\n"
+)
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run folder, made by :meth:`create` or found by :meth:`open`.
+
+    It holds ``config.yaml``, ``metrics.jsonl``, ``checkpoints/`` and whatever :meth:`write` adds.
+
+    Attributes:
+        path: the folder.
+        config: the configuration of the run as plain dicts and lists, without the schema version.
+    """
+
+    path: Path
+    config: dict[str, Any]
+
+    @classmethod
+    def create(cls, root: str | os.PathLike[str], name: str, config_yaml: str) -> RunFolder:
+        """Make the folder ``<root>/<YYYY-MM-DD_HH-MM-SS>-<name>``, with a number appended where that exists.
+
+        Args:
+            root: where the runs lie; made when missing.
+            name: what the run is called: letters, digits and ``_ . + = -``.
+            config_yaml: the resolved configuration.
+
+        Raises:
+            InputError: the name is no name for a folder, or the root cannot be written; nothing is left behind.
+        """
+        if not re.fullmatch(r"[A-Za-z0-9][\w.+=-]*", name, re.ASCII):
+            raise InputError(f"name={name!r} cannot name a folder: use letters, digits and _ . + = - only")
+        root = Path(root)
+        missing = [folder for folder in (root, *root.parents) if not folder.exists()]
+        path = None
+        try:
+            root.mkdir(parents=True, exist_ok=True)
+            path = _make_unique(root / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{name}")
+            write_atomically(path / "config.yaml", f"{_HEADER}schema_version: {SCHEMA_VERSION}\n{config_yaml}")
+        except OSError as error:
+            if path is not None:
+                shutil.rmtree(path, ignore_errors=True)
+            for folder in missing:
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+            raise InputError(
+                f"cannot write into {root} ({error.strerror}): choose a folder you can write to"
+            ) from error
+        return cls.open(path)
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str]) -> RunFolder:
+        """Open the folder of an earlier run.
+
+        Raises:
+            InputError: the folder does not exist, is no run folder, or its configuration cannot be read.
+        """
+        path = Path(path).absolute()
+        file = path / "config.yaml"
+        if not file.is_file():
+            raise InputError(
+                f"{path} is no run folder: expected config.yaml, metrics.jsonl and checkpoints/ as training makes; "
+                "give a folder such as runs/<date>-<name>"
+            )
+        return cls(path, _read_config(file))
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder for :func:`modgnn_rl.checkpoint.save_checkpoint`."""
+        return self.path / "checkpoints"
+
+    @property
+    def metrics_file(self) -> Path:
+        """The file that :meth:`log` appends to."""
+        return self.path / "metrics.jsonl"
+
+    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Append one line of JSON to ``metrics.jsonl``; it is in the file when this returns.
+
+        Args:
+            step: what the line is counted by.
+            metrics: numbers or tensors of one element; NaN and infinities are written as ``null``, which JSON can hold.
+        """
+        values = {key: float(value) for key, value in metrics.items()}
+        finite = {key: value if math.isfinite(value) else None for key, value in values.items()}
+        line = json.dumps({"step": int(step)} | finite, allow_nan=False).encode() + b"\n"
+        with self.metrics_file.open("a+b") as file:
+            if file.tell() > 0:
+                file.seek(-1, os.SEEK_END)
+                if file.read(1) != b"\n":  # a crash cut the last line; do not append to it
+                    line = b"\n" + line
+            file.write(line)
+
+    def read_metrics(self) -> list[dict[str, float]]:
+        """Return the lines of ``metrics.jsonl``; ``null`` comes back as NaN, a line cut by a crash is left out."""
+        records = []
+        text = self.metrics_file.read_text(encoding="utf-8", errors="replace") if self.metrics_file.exists() else ""
+        for number, line in enumerate(text.splitlines(), start=1):
+            try:
+                record = json.loads(line)
+                records.append({key: math.nan if value is None else value for key, value in record.items()})
+            except (ValueError, AttributeError):
+                warnings.warn(f"line {number} of {self.metrics_file} is incomplete and left out", stacklevel=2)
+        return records
+
+    def write(self, name: str, text: str) -> Path:
+        """Write a text file into the folder, whole or not at all, and return its path."""
+        write_atomically(self.path / name, text)
+        return self.path / name
+
+
+def _make_unique(path: Path) -> Path:
+    """Make a new folder called `path`, or `path-2`, `path-3` and so on where it exists."""
+    number, candidate = 1, path
+    while True:
+        try:
+            candidate.mkdir()
+        except FileExistsError:
+            number += 1
+            candidate = path.with_name(f"{path.name}-{number}")
+        else:
+            return candidate
+
+
+def _read_config(file: Path) -> dict[str, Any]:
+    """Parse a stored configuration and check its schema version."""
+    try:
+        config = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"{file} cannot be read as YAML ({reason}): restore it from a copy or use another run"
+        ) from error
+    version = config.pop("schema_version", None) if isinstance(config, dict) else None
+    if version != SCHEMA_VERSION or not isinstance(config, dict):
+        raise InputError(
+            f"{file} has schema_version {version}, this program reads {SCHEMA_VERSION}: use the one that made the run"
+        )
+    return {str(key): value for key, value in config.items()}
