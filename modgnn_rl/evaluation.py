@@ -1,0 +1,203 @@
+"""How well policies fly: flights from the same starts, measured, beside the expert's and those of doing nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.modules import get_primers_from_module, set_recurrent_mode
+
+from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.experts import LocalReynolds, Reynolds
+from modgnn_rl.metrics import (
+    action_error,
+    cohesion,
+    is_diverged,
+    is_lost,
+    leader_distance,
+    near_collisions,
+    separation,
+    smallest_distance,
+)
+from modgnn_rl.progress import Progress
+
+__all__ = ["Flights", "evaluate", "fly", "reference_policies"]
+
+QUARTERS = 4
+FRAME = 10  # cohesion, the only costly metric, is taken at each tenth step
+
+
+@dataclasses.dataclass
+class Flights:
+    """What was measured on flights, one entry a flock [F], averaged over its steps (and agents).
+
+    Attributes:
+        error: mean squared error of the action against the expert's, per component, m^2/s^2, over the controlled agents.
+        error_by_quarter: the same in the four quarters of the flight [F, 4].
+        leader_distance: distance of the leader from the centre of mass of the others, m.
+        cohesion: diameter of the smallest enclosing sphere, m.
+        separation: distance to the nearest neighbour, m.
+        squares: means of the squares of the last three, for standard deviations over time, agents and flocks.
+        smallest_distance: smallest distance of two agents in the whole flight, m.
+        near_collisions: mean number of touching pairs.
+        reward: reward of an agent, summed over the flight.
+        lost: nobody is within range of the leader at the end, bool.
+        diverged: an agent was farther than ``max_distance`` from the centre of mass at some step, bool.
+    """
+
+    error: Tensor
+    error_by_quarter: Tensor
+    leader_distance: Tensor
+    cohesion: Tensor
+    separation: Tensor
+    squares: dict[str, Tensor]
+    smallest_distance: Tensor
+    near_collisions: Tensor
+    reward: Tensor
+    lost: Tensor
+    diverged: Tensor
+
+
+def reference_policies(config: FlockingConfig) -> dict[str, TensorDictModuleBase]:
+    """The rows that every table has: the expert, the expert with a policy's eyes, and doing nothing."""
+    key = ("agents", "action")
+    gains = (config.cohesion_gain, config.separation_gain, config.alignment_gain, config.max_speed)
+    idle = TensorDictModule(_zero_action, in_keys=[("agents", "observation")], out_keys=[key])
+    return {
+        "expert": Reynolds(*gains, action=key),
+        "LocalReynolds(hops=2)": LocalReynolds(*gains, hops=2, action=key),
+        "LocalReynolds(hops=1)": LocalReynolds(*gains, hops=1, action=key),
+        "zero action": idle,
+    }
+
+
+def _zero_action(observation: Tensor) -> Tensor:
+    return torch.zeros_like(observation[..., :3])
+
+
+@torch.no_grad()
+def fly(
+    policy: TensorDictModuleBase,
+    config: FlockingConfig,
+    *,
+    num_agents: int,
+    num_flocks: int,
+    steps: int,
+    seed: int,
+    device: torch.device | str = "cpu",
+    progress: Progress | None = None,
+) -> Flights:
+    """Fly fresh flocks with a policy to the end of the episode and measure them.
+
+    Every flock is flown for all steps, also a diverged one, so that none drops out of the averages. Flights with equal
+    seeds have the same starts and the same leaders, whatever the policy.
+
+    Args:
+        policy: reads the environment's keys, writes ``("agents", "action")``; its recurrent state is added by itself.
+        config: the world.
+        num_agents: agents in a flock, N.
+        num_flocks: flocks, F.
+        steps: steps of a flight.
+        seed: seed of starts and leaders.
+        device: where to fly.
+        progress: counts flock-steps.
+    """
+    world = dataclasses.replace(config, max_distance=torch.inf, max_colliding=1.0, max_steps=steps)
+    base = FlockingEnv(num_flocks, num_agents, config=world, seed=seed, device=device)
+    primers = get_primers_from_module(policy, warn=False)
+    env = TransformedEnv(base, Compose(InitTracker(), *([primers] if primers is not None else [])))
+    expert = Reynolds.for_env(config)
+    means = _Means(num_flocks, device)
+    quarters = torch.zeros(num_flocks, QUARTERS, device=device)
+    closest = torch.full((num_flocks,), torch.inf, device=device)
+    diverged = torch.zeros(num_flocks, dtype=torch.bool, device=device)
+    tensordict = env.reset()
+    with set_recurrent_mode(False):
+        for step in range(steps):
+            position = tensordict["agents", "observation"][..., :3]
+            tensordict = expert(policy(tensordict))
+            agents = tensordict["agents"]
+            error = action_error(agents["action"], agents["expert_action"], agents["controlled"])
+            quarters[:, step * QUARTERS // steps] += error
+            means.add("error", error)
+            means.add("leader_distance", leader_distance(position))
+            means.add("separation", separation(position))
+            means.add("near_collisions", near_collisions(position, config.collision_distance))
+            if step % FRAME == 0:
+                means.add("cohesion", cohesion(position))
+            closest = torch.minimum(closest, smallest_distance(position))
+            diverged |= is_diverged(position, config.max_distance)
+            tensordict = env.step(tensordict)
+            means.add("reward", tensordict["next", "agents", "reward"].squeeze(-1))
+            tensordict = env.step_mdp(tensordict)
+            if progress is not None:
+                progress.update(num_flocks)
+    counts = torch.bincount(torch.arange(steps) * QUARTERS // steps, minlength=QUARTERS).to(device)
+    return Flights(
+        error=means["error"],
+        error_by_quarter=quarters / counts,
+        leader_distance=means["leader_distance"],
+        cohesion=means["cohesion"],
+        separation=means["separation"],
+        squares={name: means.squares[name] / means.count[name] for name in ("leader_distance", "cohesion", "separation")},
+        smallest_distance=closest,
+        near_collisions=means["near_collisions"],
+        reward=means["reward"] * steps,
+        lost=is_lost(tensordict["agents", "observation"][..., :3], config.comm_range),
+        diverged=diverged,
+    )
+
+
+class _Means:
+    """Running means over steps and agents, one entry a flock."""
+
+    def __init__(self, flocks: int, device: torch.device | str) -> None:
+        self.zero = torch.zeros(flocks, device=device, dtype=torch.float64)
+        self.sums: dict[str, Tensor] = {}
+        self.squares: dict[str, Tensor] = {}
+        self.count: dict[str, int] = {}
+
+    def add(self, name: str, value: Tensor) -> None:
+        """Add one step's values [F] or [F, N]."""
+        value = value.double().unflatten(0, (len(value), 1)).flatten(1)
+        self.sums[name] = self.sums.get(name, self.zero) + value.mean(-1)
+        self.squares[name] = self.squares.get(name, self.zero) + value.square().mean(-1)
+        self.count[name] = self.count.get(name, 0) + 1
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self.sums[name] / self.count[name]
+
+
+def evaluate(
+    policies: Mapping[str, TensorDictModuleBase],
+    config: FlockingConfig,
+    *,
+    num_agents: int,
+    num_flocks: int,
+    steps: int,
+    seed: int,
+    device: torch.device | str = "cpu",
+) -> dict[str, Flights]:
+    """Fly each policy, and the reference policies, from the same starts; progress is shown. See `fly`."""
+    policies = {**policies, **reference_policies(config)}
+    total = len(policies) * num_flocks * steps
+    flights = {}
+    with Progress(f"evaluate, {num_agents} agents", total) as progress:
+        for name, policy in policies.items():
+            progress.update(flying=name)
+            flights[name] = fly(
+                policy,
+                config,
+                num_agents=num_agents,
+                num_flocks=num_flocks,
+                steps=steps,
+                seed=seed,
+                device=device,
+                progress=progress,
+            )
+    return flights

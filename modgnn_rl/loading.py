@@ -1,0 +1,69 @@
+"""Policies from run folders."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from modgnn_rl.checkpoint import load_checkpoint
+from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
+from modgnn_rl.errors import InputError
+from modgnn_rl.models import make_model
+from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.settings import check
+
+__all__ = ["load_policy", "stored_world"]
+
+
+def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu") -> ModGNN:
+    """Load the policy that a run ended with, or reached so far.
+
+    Args:
+        folder: a run folder, ``runs/<date>-<name>``.
+        device: where the policy goes.
+
+    Returns:
+        the policy, a TensorDictModule for flocks of any size, in evaluation mode.
+
+    Raises:
+        InputError: the folder holds no run, no readable checkpoint, or one of another model.
+    """
+    run = RunFolder.open(Path(folder))
+    model = _stored(run, "model", ModelConfig)
+    policy = make_model(model.name, model.hops, model.hidden, max_speed=stored_world(run).max_speed, seed=0)
+    checkpoint = load_checkpoint(run.checkpoints)
+    try:
+        policy.load_state_dict(checkpoint.tensors["policy"])
+    except (KeyError, RuntimeError) as error:
+        raise InputError(
+            f"the checkpoint {checkpoint.path} does not fit the model '{model.name}' of {run.path / 'config.yaml'}; "
+            "restore the folder as training wrote it"
+        ) from error
+    return policy.to(device).eval()
+
+
+def stored_world(run: RunFolder) -> FlockingConfig:
+    """The world that a run was trained in.
+
+    Raises:
+        InputError: its configuration does not describe one.
+    """
+    world: FlockingConfig = _stored(run, "env", FlockingConfig)
+    return world
+
+
+def _stored(run: RunFolder, group: str, schema: type) -> Any:
+    """Read one group of a stored configuration back into its dataclass."""
+    try:
+        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), run.config.get(group, {})))
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{group} in {run.path / 'config.yaml'} is not as training wrote it: {reason}") from error
+    check(settings, group)
+    return settings

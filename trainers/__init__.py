@@ -1,0 +1,1 @@
+"""Trainers: behaviour cloning and DAgger, and the pieces they are made of."""

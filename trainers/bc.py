@@ -1,0 +1,64 @@
+"""Behaviour cloning: fit the expert's actions on the expert's own flights, as the paper did."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from modgnn_rl.configs.schema import BCConfig, TrainConfig
+from modgnn_rl.experts import Reynolds
+from modgnn_rl.loggers import GuardedLogger
+from modgnn_rl.models import make_model
+from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.trainers.collection import flocks_of_all_sizes
+from modgnn_rl.trainers.journal import Journal
+from modgnn_rl.trainers.learner import Learner
+
+__all__ = ["bc"]
+
+ROUNDS = 40  # lines of metrics
+
+
+def bc(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN:
+    """Train a policy by behaviour cloning.
+
+    The validation error is taken on the expert's flights of flocks that are not trained on. It says little of how the
+    policy flies: it never meets the states that its own errors lead to.
+
+    Args:
+        config: the run's settings, ``config.trainer`` being a `BCConfig`.
+        run: the folder to leave metrics and checkpoints in.
+        logger: the dashboard.
+
+    Returns:
+        the trained policy: the moving average of the weights.
+    """
+    settings: BCConfig = config.trainer
+    model = config.model
+    policy = make_model(model.name, model.hops, model.hidden, max_speed=config.env.max_speed, seed=config.seed)
+    sizes = config.env.sizes
+    total = settings.cloning_updates * len(sizes)
+    learner = Learner(policy.to(config.device), settings, (total, total), config.seed)
+    expert = Reynolds.for_env(config.env)
+    flown = {"steps": settings.cloning_steps, "stretch": settings.cloning_steps}
+    training = flocks_of_all_sizes(config, learner.flown, expert, **flown)
+    held_out = dataclasses.replace(settings, num_envs=settings.held_out)
+    validation = flocks_of_all_sizes(
+        dataclasses.replace(config, trainer=held_out, seed=config.seed + 1_000_000), learner.flown, expert, **flown
+    )
+    in_round = max(1, settings.cloning_updates // ROUNDS)
+
+    with Journal(run, logger, learner, total, settings) as journal:
+        for group in (*training, *validation):
+            group.fly(expert_share=1.0)
+            group.close()
+        for step in range(0, settings.cloning_updates, in_round):
+            updates = min(in_round, settings.cloning_updates - step)
+            metrics = {"learning_rate": learner.learning_rate}
+            for group, unseen in zip(training, validation, strict=True):
+                metrics[f"{group.num_agents}/loss"] = learner.fit(group.buffer, updates)
+                metrics[f"{group.num_agents}/validation_loss"] = learner.validate(unseen.buffer)
+            loss = sum(metrics[f"{size}/validation_loss"] for size in sizes) / len(sizes)
+            journal.note(learner.updates_done, metrics, updates * len(sizes), validation_loss=loss)
+
+    return learner.flown
