@@ -75,7 +75,9 @@ class FlockingEnv(EnvBase):
         check(self.config, "env")
         for name, count in (("num_envs", num_envs), ("num_agents", self.num_agents)):
             if not isinstance(count, int) or count < 1:
-                raise InputError(f"{name}={count!r} is not a positive integer; one environment holds flocks of one size")
+                raise InputError(
+                    f"{name}={count!r} is not a positive integer; one environment holds flocks of one size"
+                )
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.dtype = dtype
         self.physics = make_physics(self.config, num_envs, self.num_agents, self.device, dtype)
@@ -121,9 +123,7 @@ class FlockingEnv(EnvBase):
         rows = mask.view(-1).nonzero().view(-1)
         config, size = self.config, self.num_agents
         radius = config.start_radius * (size / 32) ** (1 / 3)
-        start = uniform_ball(
-            len(rows), size, radius, config.start_distance, generator=self.generator, dtype=self.dtype
-        )
+        start = uniform_ball(len(rows), size, radius, config.start_distance, generator=self.generator, dtype=self.dtype)
         self.physics.reset(rows, start, torch.zeros_like(start))
         self.leader_velocity = self.leader_velocity.masked_fill(mask, 0.0)
         self.step_count = self.step_count.masked_fill(mask, 0)
@@ -140,9 +140,7 @@ class FlockingEnv(EnvBase):
         action = tensordict["agents", "action"]
         self._refuse_nonfinite(action)
         step = config.leader_noise * config.control_frequency**-0.5
-        noise = torch.randn(
-            self.leader_velocity.shape, generator=self.generator, device=self.device, dtype=self.dtype
-        )
+        noise = torch.randn(self.leader_velocity.shape, generator=self.generator, device=self.device, dtype=self.dtype)
         self.leader_velocity = clip_to_ball(self.leader_velocity + step * noise, config.leader_max_speed)
         target = torch.where(
             self.controlled.unsqueeze(-1),
@@ -175,7 +173,7 @@ class FlockingEnv(EnvBase):
             device=self.device,
         )
         return TensorDict(
-            {"agents": agents, "adjacency": distances < self.config.comm_range}, self.batch_size, device=self.device
+            {"agents": agents, "adjacency": distances <= self.config.comm_range}, self.batch_size, device=self.device
         )
 
     def _refuse_nonfinite(self, action: Tensor) -> None:

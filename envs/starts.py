@@ -39,10 +39,10 @@ def uniform_ball(
     """
 
     def draw() -> Tensor:
-        shape, options = (flocks, agents), {"generator": generator, "device": generator.device, "dtype": dtype}
-        direction = torch.randn(*shape, 3, **options)
-        direction = direction / direction.norm(dim=-1, keepdim=True)
-        return radius * torch.rand(*shape, 1, **options).pow(1 / 3) * direction
+        device = generator.device
+        direction = torch.randn(flocks, agents, 3, generator=generator, device=device, dtype=dtype)
+        share = torch.rand(flocks, agents, 1, generator=generator, device=device, dtype=dtype)
+        return radius * share.pow(1 / 3) * direction / direction.norm(dim=-1, keepdim=True)
 
     position = draw()
     for _ in range(MAX_DRAWS):

@@ -25,7 +25,7 @@ def missing(like: Tensor) -> Tensor:
 
 
 class AgentCache(TensorDictPrimer):
-    """Primer whose shapes follow the environment that it is appended to, so that one module serves any number of agents.
+    """Primer whose shapes follow the environment that it is appended to, so that a module serves any number of agents.
 
     It adds the keys to the environment's specs and zeroes them at resets; modules look at ``is_init`` and read no cache
     there.
@@ -37,6 +37,7 @@ class AgentCache(TensorDictPrimer):
 
     def __init__(self, module: TensorDictModuleBase, keys: Sequence[str]) -> None:
         super().__init__(primers=Composite({key: Unbounded(()) for key in keys}), expand_specs=False)
+        self._keys = tuple(keys)
         # A bound method, since the module must not become a part of the environment; None once the shapes are known.
         self._run_once: Callable[[TensorDictBase], TensorDictBase] | None = module.forward
 
@@ -57,7 +58,7 @@ class AgentCache(TensorDictPrimer):
         seen["is_init"] = torch.ones(*spec.shape, 1, dtype=torch.bool, device=spec.device)
         with torch.no_grad(), set_recurrent_mode(False):
             state = self._run_once(seen)["next"]
-        like = {key: state[key] for key in self.primers.keys()}
+        like = {key: state[key] for key in self._keys}
         specs = {key: Unbounded(value.shape, device=value.device, dtype=value.dtype) for key, value in like.items()}
         self.primers = Composite(specs, shape=spec.shape, device=spec.device)
         self._run_once = None

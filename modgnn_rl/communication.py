@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import torch
 from torch import Tensor, nn
 
 __all__ = ["Adjacency", "Laplacian", "Links", "links", "sum_over_links"]

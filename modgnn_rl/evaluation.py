@@ -37,7 +37,7 @@ class Flights:
     """What was measured on flights, one entry a flock [F], averaged over its steps (and agents).
 
     Attributes:
-        error: mean squared error of the action against the expert's, per component, m^2/s^2, over the controlled agents.
+        error: mean squared error of the action against the expert's, per component, m^2/s^2, over controlled agents.
         error_by_quarter: the same in the four quarters of the flight [F, 4].
         leader_distance: distance of the leader from the centre of mass of the others, m.
         cohesion: diameter of the smallest enclosing sphere, m.
@@ -66,12 +66,11 @@ class Flights:
 def reference_policies(config: FlockingConfig) -> dict[str, TensorDictModuleBase]:
     """The rows that every table has: the expert, the expert with a policy's eyes, and doing nothing."""
     key = ("agents", "action")
-    gains = (config.cohesion_gain, config.separation_gain, config.alignment_gain, config.max_speed)
     idle = TensorDictModule(_zero_action, in_keys=[("agents", "observation")], out_keys=[key])
     return {
-        "expert": Reynolds(*gains, action=key),
-        "LocalReynolds(hops=2)": LocalReynolds(*gains, hops=2, action=key),
-        "LocalReynolds(hops=1)": LocalReynolds(*gains, hops=1, action=key),
+        "expert": Reynolds.for_env(config, action=key),
+        "LocalReynolds(hops=2)": LocalReynolds.for_env(config, hops=2, action=key),
+        "LocalReynolds(hops=1)": LocalReynolds.for_env(config, hops=1, action=key),
         "zero action": idle,
     }
 
@@ -144,7 +143,9 @@ def fly(
         leader_distance=means["leader_distance"],
         cohesion=means["cohesion"],
         separation=means["separation"],
-        squares={name: means.squares[name] / means.count[name] for name in ("leader_distance", "cohesion", "separation")},
+        squares={
+            name: means.squares[name] / means.count[name] for name in ("leader_distance", "cohesion", "separation")
+        },
         smallest_distance=closest,
         near_collisions=means["near_collisions"],
         reward=means["reward"] * steps,

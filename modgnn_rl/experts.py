@@ -7,7 +7,7 @@ what a decentralised policy can see, and is the yardstick for such policies.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -16,10 +16,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from modgnn_rl.cache import AgentCache, missing
-from modgnn_rl.tensors import clip_to_ball, pair_differences
-
-if TYPE_CHECKING:
-    from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.tensors import clip_to_ball, pair_differences, squared_norm
 
 __all__ = ["LocalReynolds", "Reynolds", "reachable", "reynolds"]
 
@@ -55,14 +53,14 @@ def reynolds(
         target velocity, m/s [..., N, 3].
     """
     offset, drift = pair_differences(position), pair_differences(velocity)
-    distance = (offset.square().sum(0) + SOFTENING).sqrt()
-    pull = cohesion * distance - separation / (distance * distance * distance)
-    follow = alignment * (drift.square().sum(0) + SOFTENING).sqrt()
+    square = squared_norm(offset) + SOFTENING
+    distance = square.sqrt()
+    pull = cohesion * distance - separation / (square * distance)
+    follow = alignment * (squared_norm(drift) + SOFTENING).sqrt()
+    force = [torch.addcmul(pull * p, follow, v) for p, v in zip(offset, drift, strict=True)]
     if visible is not None:
-        pull, follow = (torch.where(visible, weight, 0.0) for weight in (pull, follow))
-        offset, drift = (torch.where(visible, pair, 0.0) for pair in (offset, drift))
-    force = (pull * offset).sum(-1) + (follow * drift).sum(-1)
-    return clip_to_ball(force.movedim(0, -1), max_speed)
+        force = [torch.where(visible, component, 0.0) for component in force]
+    return clip_to_ball(torch.stack([component.sum(-1) for component in force], -1), max_speed)
 
 
 def reachable(adjacency: Tensor, hops: int) -> Tensor:
@@ -96,7 +94,7 @@ class Reynolds(TensorDictModuleBase):
         action: NestedKey = ("agents", "expert_action"),
     ) -> None:
         super().__init__()
-        self.rule = {
+        self.rule: dict[str, Any] = {
             "cohesion": cohesion,
             "separation": separation,
             "alignment": alignment,
@@ -106,10 +104,10 @@ class Reynolds(TensorDictModuleBase):
         self.out_keys: Sequence[NestedKey] = [action]
 
     @classmethod
-    def for_env(cls, config: FlockingConfig, **options: object) -> Reynolds:
+    def for_env(cls, config: FlockingConfig, **options: Any) -> Self:
         """The expert of a flocking world, with that world's gains."""
         gains = (config.cohesion_gain, config.separation_gain, config.alignment_gain)
-        return cls(*gains, config.max_speed, **options)  # type: ignore[arg-type]
+        return cls(*gains, config.max_speed, **options)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the expert's action [..., N, 3]."""

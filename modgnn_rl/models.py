@@ -72,8 +72,8 @@ class PairForce(nn.Module):
     r"""The force between two agents, equivariant to rotations and reflections.
 
     With the relative position r u (distance r, unit vector u), the relative velocity w and the receiver's own velocity
-    v, a small network maps the invariants to (a, b, c), and the force is ``a u + b w + c v``. Forces are summed over the
-    neighbours, so that a policy trained at one flock size flies at others.
+    v, a small network maps the invariants to (a, b, c), and the force is ``a u + b w + c v``. Forces are summed over
+    the neighbours, so that a policy trained at one flock size flies at others.
 
     Args:
         hidden: width of the network's two hidden layers.
@@ -115,10 +115,12 @@ class PairForce(nn.Module):
 
 
 def modgnn_mlp(hops: int, hidden: int, max_speed: float) -> ModGNNLayer:
-    """ModGNN-MLP of the paper: three-layer networks for f_pre, f_mid (10 features out) and f_final, one for each hop."""
+    """ModGNN-MLP of the paper: three-layer networks for f_pre, f_mid (10 features out) and f_final, one a hop."""
     f_pre = [nn.Sequential(Scale(hide_position=hop == 0), _mlp(6, hidden, LATENT)) for hop in range(hops + 1)]
     f_mid = [_mlp(LATENT, hidden, LATENT) for _ in range(hops + 1)]
-    return ModGNNLayer(hops, f_pre=f_pre, f_mid=f_mid, f_final=nn.Sequential(_mlp(LATENT, hidden, 3), BallHead(max_speed)))
+    return ModGNNLayer(
+        hops, f_pre=f_pre, f_mid=f_mid, f_final=nn.Sequential(_mlp(LATENT, hidden, 3), BallHead(max_speed))
+    )
 
 
 def gcn(hops: int, hidden: int, max_speed: float) -> ModGNNLayer:

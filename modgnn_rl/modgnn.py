@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from typing import cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
+from torch.nn.functional import pad
 from torchrl.modules import recurrent_mode
 
 from modgnn_rl.cache import AgentCache, missing
@@ -123,7 +125,7 @@ class ModGNNLayer(nn.Module):
         sent = []
         for hop in range(1, self.hops + 1):
             sent.append(data)
-            stored = None if messages is None else messages[..., hop - 1, :]
+            stored = None if messages is None else messages[..., hop - 1, : data.shape[-1]]
             before = _one_step_earlier(data.unflatten(0, observation.shape[:-1]), stored, is_init).flatten(0, -2)
             held = ~before.isnan().any(-1, keepdim=True)
             if self.start == "zero":
@@ -144,7 +146,7 @@ class ModGNNLayer(nn.Module):
         return output.unflatten(0, observation.shape[:-1]), stacked.unflatten(0, observation.shape[:-1])
 
     def _incoming(self, before: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
-        """y of the links, given what every node held one step earlier [R, D]."""
+        """Y of the links, given what every node held one step earlier [R, D]."""
         return lambda sender, receiver: self.f_com(before.index_select(0, sender), before.index_select(0, receiver))
 
     def _processed(self, hop: int, before: Tensor, own: Own) -> Callable[[Tensor, Tensor], Tensor]:
@@ -167,8 +169,8 @@ class ModGNN(TensorDictModuleBase):
 
     The module runs one environment step, or under ``torchrl.modules.set_recurrent_mode(True)`` a window [*B, T]. In a
     window, a missing ``is_init`` says that it begins an episode; where ``is_init`` is false at its first step, the
-    ``messages`` stored there are used. ``FlockingEnv`` needs the recurrent state in its specs: the collectors of TorchRL
-    do that by themselves (``auto_register_policy_transforms=True``), elsewhere append ``InitTracker()`` and
+    ``messages`` stored there are used. An environment needs the recurrent state in its specs: the collectors of TorchRL
+    see to it by themselves (``auto_register_policy_transforms=True``), elsewhere append ``InitTracker()`` and
     `make_tensordict_primer`.
 
     Args:
@@ -191,7 +193,8 @@ class ModGNN(TensorDictModuleBase):
         action: NestedKey = ("agents", "action"),
     ) -> None:
         super().__init__()
-        self.layers = nn.ModuleList([layers] if isinstance(layers, ModGNNLayer) else layers)
+        modules = nn.ModuleList([layers] if isinstance(layers, ModGNNLayer) else layers)
+        self.layers = cast(Sequence[ModGNNLayer], modules)
         key = unravel_key(observation)
         self._group = key[:-1] if isinstance(key, tuple) else ()
         own = {name for layer in self.layers for name in layer.own_keys}
@@ -246,7 +249,8 @@ class ModGNN(TensorDictModuleBase):
             seen = torch.cat((seen, output), -1)
             first += layer.hops
             sent.append(sends)
-        return output, torch.cat(sent, -2)
+        width = max(sends.shape[-1] for sends in sent)
+        return output, torch.cat([pad(sends, (0, width - sends.shape[-1])) for sends in sent], -2)
 
     def make_tensordict_primer(self) -> AgentCache:
         """The transform that puts ``messages`` into an environment's specs, sized by that environment."""
@@ -285,5 +289,7 @@ def _per_hop(name: str, module: Submodule | Sequence[Submodule], hops: int) -> n
     """One module for each of the hops 0..K: the given ones, or the given one shared by all."""
     modules = [module] * (hops + 1) if module is None or isinstance(module, nn.Module) else list(module)
     if len(modules) != hops + 1:
-        raise InputError(f"{name} has {len(modules)} modules; hops={hops} needs one module, or {hops + 1} (hops 0..{hops})")
+        raise InputError(
+            f"{name} has {len(modules)} modules; hops={hops} needs one module, or {hops + 1} (hops 0..{hops})"
+        )
     return nn.ModuleList([_or_identity(item) for item in modules])

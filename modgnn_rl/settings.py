@@ -32,6 +32,8 @@ def setting(
     above: float | None = None,
     high: float | None = None,
     choices: Iterable[Any] | None = None,
+    whole: bool = False,
+    length: int | None = None,
 ) -> Any:
     """Declare a dataclass field with its documentation and its legal values.
 
@@ -42,8 +44,10 @@ def setting(
         above: exclusive lower bound.
         high: largest legal value.
         choices: the legal values, where they can be listed.
+        whole: accept whole numbers and lists of them only; for settings that may be either.
+        length: length of a list.
     """
-    metadata: dict[str, Any] = {"doc": doc, "low": low, "above": above, "high": high}
+    metadata: dict[str, Any] = {"doc": doc, "low": low, "above": above, "high": high, "whole": whole, "length": length}
     metadata["choices"] = None if choices is None else tuple(choices)
     if isinstance(default, list):
         return dataclasses.field(default_factory=lambda: copy.copy(default), metadata=metadata)
@@ -66,8 +70,17 @@ def check(config: Any, path: str = "") -> None:
         if dataclasses.is_dataclass(value):
             check(value, name)
         elif "doc" in field.metadata:
-            for item in value if isinstance(value, (list, tuple)) else [value]:
-                _check_value(name, item, field.metadata)
+            _check_list(name, value, field.metadata)
+
+
+def _check_list(name: str, value: Any, rule: Any) -> None:
+    """Raise InputError unless a value, or each item of a list, obeys the metadata written by `setting`."""
+    items = list(value) if isinstance(value, (list, tuple)) else [value]
+    length = rule["length"] or max(1, len(items))
+    if len(items) != length:
+        raise InputError(f"{name}={items} has {len(items)} values; it needs {length} ({rule['doc']})")
+    for item in items:
+        _check_value(name, item, rule)
 
 
 def _check_value(name: str, value: Any, rule: Any) -> None:
@@ -76,6 +89,8 @@ def _check_value(name: str, value: Any, rule: Any) -> None:
     if choices is not None and value not in choices:
         hint = suggestion(str(value), [str(choice) for choice in choices])
         raise InputError(f"{name}={value} is not one of {', '.join(map(str, choices))}{hint}")
+    if rule["whole"] and value is not None and (isinstance(value, bool) or not isinstance(value, int)):
+        raise InputError(f"{name}={value} is not a whole number or a list of them ({rule['doc']})")
     if value is None or isinstance(value, (str, bool)) or not isinstance(value, (int, float)):
         return
     if math.isnan(value):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-__all__ = ["clip_to_ball", "pair_distances", "pair_differences"]
+__all__ = ["clip_to_ball", "pair_differences", "pair_distances", "squared_norm"]
 
 
 def clip_to_ball(vector: Tensor, radius: float) -> Tensor:
@@ -17,14 +19,25 @@ def clip_to_ball(vector: Tensor, radius: float) -> Tensor:
     return vector * (radius / norm).clamp(max=1.0)
 
 
-def pair_differences(vector: Tensor) -> Tensor:
-    """Differences of all pairs, components first: entry c, i, j is ``x_j - x_i``; [..., N, D] -> [D, ..., N, N]."""
-    components = vector.movedim(-1, 0)
-    return components.unsqueeze(-2) - components.unsqueeze(-1)
+def pair_differences(vector: Tensor) -> list[Tensor]:
+    """Differences of all pairs, one tensor [..., N, N] a component of [..., N, D]: entry i, j is ``x_j - x_i``.
+
+    Separate components keep everything that follows pointwise, several times faster on a CPU than [..., N, N, D].
+    """
+    return [component.unsqueeze(-2) - component.unsqueeze(-1) for component in vector.unbind(-1)]
+
+
+def squared_norm(components: Sequence[Tensor]) -> Tensor:
+    """Sum of the squares of components that are tensors of their own."""
+    first, *others = components
+    total = first * first
+    for component in others:
+        total = torch.addcmul(total, component, component)
+    return total
 
 
 def pair_distances(position: Tensor) -> Tensor:
-    """Distances of all pairs [..., N, 3] -> [..., N, N]; infinite on the diagonal, so that nobody is its own neighbour."""
-    distance = pair_differences(position).square().sum(0).sqrt()
-    infinite = torch.full((), torch.inf, dtype=distance.dtype, device=distance.device)
-    return torch.where(torch.eye(position.shape[-2], dtype=torch.bool, device=distance.device), infinite, distance)
+    """Distances of all pairs [..., N, 3] -> [..., N, N]; infinite on the diagonal: nobody is its own neighbour."""
+    square = squared_norm(pair_differences(position))
+    square.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
+    return square.sqrt()

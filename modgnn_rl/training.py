@@ -44,7 +44,7 @@ def train(config: TrainConfig) -> RunFolder:
         for size, table in tables.items()
         for row, figures in table.items()
     }
-    logger.log(run.read_metrics()[-1]["step"], errors)
+    logger.log(int(run.read_metrics()[-1]["step"]), errors)
     where = logger.close()
     if where:
         print(where)

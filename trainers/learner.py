@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -44,7 +45,7 @@ class Learner:
     @property
     def flown(self) -> ModGNN:
         """The moving average of the policy: it collects, is evaluated and is what a run ends with."""
-        return self.averaged.module
+        return cast(ModGNN, self.averaged.module)
 
     @property
     def learning_rate(self) -> float:
@@ -75,9 +76,9 @@ class Learner:
         settings = self.settings
         if settings.rotate:
             rotations = random_rotations(len(batch), batch["agents", "observation"], self.generator)
-            vectors = [("agents", "observation"), ("agents", "expert_action")]
+            vectors: list[NestedKey] = [("agents", "observation"), ("agents", "expert_action")]
             # Messages are kept in the data only where they are made of observed vectors.
-            vectors += [policy.messages_key] if policy.messages_key in batch.keys() else []
+            vectors += [policy.messages_key] if policy.messages_key in batch else []
             for key in vectors:
                 batch[key] = rotate(batch[key], rotations)
         controlled = batch["agents", "controlled"][:, -1]
