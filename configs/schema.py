@@ -33,7 +33,9 @@ class FlockingConfig:
     The defaults are the well-posed preset S1; ``env=paper`` is the preset nearest to the paper (R).
     """
 
-    num_agents: Any = setting(32, "agents in a flock, the leader included; a list trains on several sizes at once", low=1)
+    num_agents: Any = setting(
+        32, "agents in a flock, the leader included; a list trains on several sizes at once", low=1, whole=True
+    )
     comm_range: float = setting(3.5, "distance within which agents hear each other, m", above=0)
     max_steps: int = setting(1000, "control steps after which an episode is truncated", low=1)
     max_speed: float = setting(0.92, "target velocities are projected onto the ball of this radius, m/s", above=0)
@@ -42,10 +44,16 @@ class FlockingConfig:
     separation_gain: float = setting(0.8, "expert: weight C_s of the Reynolds separation term", low=0)
     alignment_gain: float = setting(0.02, "expert: weight C_a of the Reynolds alignment term", low=0)
 
-    start_radius: float = setting(4.0, "radius of the starting ball of 32 agents, m; it scales with (N / 32)^(1/3)", above=0)
+    start_radius: float = setting(
+        4.0, "radius of the starting ball of 32 agents, m; it scales with (N / 32)^(1/3)", above=0
+    )
     start_distance: float = setting(0.3, "smallest distance between two agents at the start, m", low=0)
-    leader_noise: float = setting(0.10, "leader: its target velocity gains N(0, leader_noise^2 dt) each step, m/s^1.5", low=0)
-    leader_max_speed: float = setting(0.8, "leader: its target velocity is kept in the ball of this radius, m/s", above=0)
+    leader_noise: float = setting(
+        0.10, "leader: its target velocity gains N(0, leader_noise^2 dt) each step, m/s^1.5", low=0
+    )
+    leader_max_speed: float = setting(
+        0.8, "leader: its target velocity is kept in the ball of this radius, m/s", above=0
+    )
 
     physics: str = setting("torch", "physics engine", choices=("torch",))
     control_frequency: float = setting(48.0, "control steps a second, Hz", above=0)
@@ -89,10 +97,15 @@ class ImitationConfig:
     capacity: int = setting(16_000, "flock states kept for each size; the oldest go first", low=1)
     batch_size: int = setting(256, "flock states in a batch", low=1)
     receivers: int = setting(
-        8, "agents of a state of 32 whose error counts in an update; at other sizes N, as many links: 32 / N times", low=1
+        8,
+        "agents of a state of 32 whose error counts in an update; at other sizes N, as many links: 32 / N times",
+        low=1,
     )
     learning_rates: list[float] = setting(
-        [3e-3, 1e-3, 1e-4], "Adam: at the start, after the cloning updates, at the end; cosines between", above=0
+        [3e-3, 1e-3, 1e-4],
+        "Adam: at the start, after the cloning updates, at the end; cosines between",
+        above=0,
+        length=3,
     )
     averaging: float = setting(0.99, "decay of the moving average of the weights, which is what flies", low=0, high=1)
     max_gradient: float = setting(1.0, "gradients are clipped to this norm", above=0)
@@ -149,7 +162,7 @@ class EvaluationConfig:
     """Flights that tell how good a policy is."""
 
     num_flocks: int = setting(100, "fresh flocks that each policy flies", low=2)
-    num_agents: Any = setting(None, "agents in a flock, or a list of sizes; null: as in training", low=1)
+    num_agents: Any = setting(None, "agents in a flock, or a list of sizes; null: as in training", low=1, whole=True)
     steps: int = setting(1000, "steps of a flight", low=4)
     seed: int = setting(1_000_000, "seed of starts and leaders, apart from those of training", low=0)
 
