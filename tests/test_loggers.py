@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from modgnn_rl.configs.schema import LoggerConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.loggers import GuardedLogger, LoggerConfig, check_logger, make_logger
+from modgnn_rl.loggers import GuardedLogger, check_logger, make_logger
 from modgnn_rl.run_folder import RunFolder
 
 

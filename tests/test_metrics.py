@@ -183,7 +183,7 @@ def test_nan_agent_shows_in_the_separation_of_its_flock_only() -> None:
 @pytest.mark.parametrize("leader", [-1, 4])
 def test_unknown_leader_is_refused(function: object, leader: int) -> None:
     with pytest.raises(InputError, match="not an agent"):
-        function(torch.zeros(4, 3), leader)  # type: ignore[operator]
+        function(torch.zeros(4, 3), leader)
 
 
 def test_empty_batch() -> None:

@@ -1,0 +1,93 @@
+"""Evaluation flights and their table."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+
+from modgnn_rl import make_model
+from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.evaluation import evaluate, fly, reference_policies
+from modgnn_rl.table import as_json, as_markdown, summarise_flights
+
+FLIGHT = {"num_agents": 6, "num_flocks": 4, "steps": 40, "seed": 3}
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return evaluate({"gcn": make_model("gcn", seed=0)}, FlockingConfig(), **FLIGHT)
+
+
+def test_reference_rows_have_the_errors_they_must_have(flights):
+    assert flights["expert"].error.max() == 0
+    assert (flights["zero action"].error > flights["LocalReynolds(hops=2)"].error).all()
+    # The expert is clipped to the ball of 0.92 m/s and mostly on its surface: doing nothing scores |u|^2 / 3.
+    assert 0.2 < float(flights["zero action"].error.mean()) <= 0.92**2 / 3
+
+
+def test_the_flight_is_fixed_by_its_seed(flights):
+    again = fly(make_model("gcn", seed=0), FlockingConfig(), **FLIGHT)
+    assert torch.equal(again.error, flights["gcn"].error)
+    assert torch.equal(again.smallest_distance, flights["gcn"].smallest_distance)
+
+
+def test_all_rows_have_the_same_starts_and_leaders():
+    """In the first step nothing has been flown yet, and the leader listens to nobody."""
+    seen = {}
+
+    class Spy(TensorDictSequential):
+        def forward(self, tensordict):
+            seen.setdefault(self, []).append(tensordict["agents", "observation"].clone())
+            return super().forward(tensordict)
+
+    for policy in reference_policies(FlockingConfig()).values():
+        fly(Spy(policy), FlockingConfig(), **FLIGHT)
+    first, *others = seen.values()
+    assert len(others) == 3
+    for other in others:
+        assert torch.equal(first[0], other[0])
+        for mine, theirs in zip(first, other, strict=True):
+            assert torch.equal(mine[:, 0], theirs[:, 0])
+
+
+def test_quarters_average_to_the_error(flights):
+    for flight in flights.values():
+        torch.testing.assert_close(flight.error_by_quarter.mean(-1).double(), flight.error, rtol=1e-4, atol=1e-6)
+
+
+def test_a_diverging_flock_is_flown_to_the_end_and_counted():
+    away = TensorDictModule(
+        lambda observation: 10 * observation[..., :3], [("agents", "observation")], [("agents", "action")]
+    )
+    flight = fly(away, FlockingConfig(max_distance=5.0), num_agents=6, num_flocks=3, steps=400, seed=0)
+    assert flight.diverged.all()
+    assert flight.lost.all()
+
+
+def test_a_single_agent_has_a_table_too():
+    flights = evaluate({}, FlockingConfig(), num_agents=2, num_flocks=3, steps=8, seed=0)
+    assert "| expert" in as_markdown({2: summarise_flights(flights, 0)}, "two")
+
+
+def test_table_gives_mean_median_spread_and_paired_difference(flights):
+    table = summarise_flights(flights, seed=0)
+    row = table["gcn"]
+    errors = flights["gcn"].error
+    assert row["error"]["mean"] == pytest.approx(float(errors.mean()))
+    assert row["error"]["median"] == pytest.approx(float(errors.quantile(0.5)))
+    assert row["error"]["low"] <= row["error"]["mean"] <= row["error"]["high"]
+    difference = errors - flights["LocalReynolds(hops=1)"].error
+    assert row["error_minus_local"]["mean"] == pytest.approx(float(difference.mean()))
+    assert "error_minus_local" not in table["LocalReynolds(hops=1)"]
+
+
+def test_json_and_markdown_hold_every_row(flights):
+    tables = {6: summarise_flights(flights, seed=0)}
+    parsed = json.loads(as_json(tables, {"steps": 40}))
+    assert parsed["steps"] == 40
+    assert set(parsed["tables"]["6"]) == set(flights)
+    text = as_markdown(tables, "title")
+    assert all(f"| {name} " in text for name in flights)

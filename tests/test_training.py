@@ -1,0 +1,162 @@
+"""The main job as a user runs it, in small."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+import yaml
+from tensordict import TensorDict
+
+from modgnn_rl import load_policy
+from modgnn_rl.configs.schema import (
+    BCConfig,
+    DAggerConfig,
+    EvaluateConfig,
+    EvaluationConfig,
+    FlockingConfig,
+    LoggerConfig,
+    ModelConfig,
+    TrainConfig,
+)
+from modgnn_rl.errors import InputError
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.training import evaluate_run, prepare_torch, train
+
+SMALL = {"num_envs": 2, "batch_size": 16, "capacity": 400}
+
+
+def _config(runs, trainer, **others):
+    settings = {
+        "env": FlockingConfig(num_agents=5),
+        "evaluation": EvaluationConfig(num_flocks=3, steps=12),
+        "runs": str(runs),
+        "threads": 1,
+    }
+    return TrainConfig(trainer=trainer, **{**settings, **others})
+
+
+def _dagger(**settings):
+    small = {"cloning_steps": 10, "cloning_updates": 3, "rounds": 3, "round_steps": 5, "round_updates": 2}
+    return DAggerConfig(**{**SMALL, **small, **settings})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> RunFolder:
+    return train(_config(tmp_path_factory.mktemp("runs"), _dagger(), logger=LoggerConfig(name="csv")))
+
+
+def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
+    config = yaml.safe_load((run.path / "config.yaml").read_text())
+    assert config["trainer"]["rounds"] == 3
+    assert config["env"]["comm_range"] == 3.5
+    metrics = run.read_metrics()
+    assert [line["step"] for line in metrics] == [0, 1, 2, 3]
+    for name in ("error", "loss", "leader_distance", "cohesion", "separation", "smallest_distance"):
+        assert f"5/{name}" in metrics[-1]
+    assert list(run.checkpoints.iterdir())
+    table = json.loads((run.path / "evaluation.json").read_text())["tables"]["5"]
+    rows = ["pair_force", "expert", "LocalReynolds(hops=2)", "LocalReynolds(hops=1)", "zero action"]
+    assert list(table) == rows
+    assert all(row in (run.path / "evaluation.md").read_text() for row in rows)
+
+
+@pytest.mark.parametrize("agents", [1, 2, 9])
+def test_the_policy_loads_and_flies_at_any_size(run, agents):
+    policy = load_policy(run.path)
+    agents_data = TensorDict({"observation": torch.randn(4, agents, 6)}, [4])
+    step = TensorDict({"agents": agents_data, "adjacency": torch.zeros(4, agents, agents, dtype=torch.bool)}, [4])
+    step["is_init"] = torch.ones(4, 1, dtype=torch.bool)
+    assert policy(step)["agents", "action"].shape == (4, agents, 3)
+
+
+def test_evaluation_repeats_what_training_ended_with(run):
+    before = (run.path / "evaluation.json").read_text()
+    settings = EvaluationConfig(num_flocks=3, steps=12)
+    evaluate_run(EvaluateConfig(run=str(run.path), evaluation=settings, threads=1))
+    assert (run.path / "evaluation.json").read_text() == before
+
+
+def test_evaluation_at_other_sizes(run):
+    settings = EvaluationConfig(num_flocks=2, steps=4, num_agents=[3, 7])
+    evaluate_run(EvaluateConfig(run=str(run.path), evaluation=settings, threads=1))
+    assert list(json.loads((run.path / "evaluation.json").read_text())["tables"]) == ["3", "7"]
+
+
+def test_one_seed_fixes_a_run(tmp_path):
+    metrics = []
+    for seed in (1, 1, 2):
+        run = train(_config(tmp_path, _dagger(), seed=seed, name=f"seed{seed}"))
+        metrics.append((run.metrics_file.read_bytes(), (run.path / "evaluation.json").read_bytes()))
+    assert metrics[0] == metrics[1]
+    assert metrics[0] != metrics[2]
+
+
+@pytest.mark.parametrize("model", ["modgnn_mlp", "gcn", "pair_force"])
+def test_behaviour_cloning_of_several_sizes(tmp_path, model):
+    trainer = BCConfig(**SMALL, cloning_steps=30, cloning_updates=10, held_out=2)
+    env = FlockingConfig(num_agents=[3, 6])
+    run = train(_config(tmp_path, trainer, env=env, model=ModelConfig(name=model, hops=2, hidden=8)))
+    assert {"3/validation_loss", "6/validation_loss"} <= set(run.read_metrics()[-1])
+    assert list(json.loads((run.path / "evaluation.json").read_text())["tables"]) == ["3", "6"]
+
+
+@pytest.mark.slow  # about three minutes
+def test_dagger_learns_to_fly_better_than_the_local_expert(tmp_path):
+    run = train(_config(tmp_path, DAggerConfig(), env=FlockingConfig(), evaluation=EvaluationConfig()))
+    table = json.loads((run.path / "evaluation.json").read_text())["tables"]["32"]
+    assert table["pair_force"]["error"]["mean"] < 0.09
+    assert table["pair_force"]["error_minus_local"]["high"] < 0
+
+
+def test_a_device_that_is_not_there():
+    with pytest.raises(InputError, match="device=cuda:99 cannot be used"):
+        prepare_torch("cuda:99", 1)
+
+
+def test_a_policy_of_another_model_is_refused(run, tmp_path):
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    text = (run.path / "config.yaml").read_text().replace("name: pair_force", "name: gcn")
+    (copy / "config.yaml").write_text(text)
+    (copy / "checkpoints").symlink_to(run.checkpoints)
+    with pytest.raises(InputError, match="does not fit the model 'gcn'"):
+        load_policy(copy)
+
+
+def _command(module, *arguments, folder):
+    command = [sys.executable, "-m", f"modgnn_rl.{module}", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["trainer=dager"], "did you mean 'dagger'"),
+        (["env.comm_rnge=3"], "did you mean 'env.comm_range'"),
+        (["env.comm_range=-1"], "env.comm_range=-1.0 is out of range"),
+        (["trainer.rounds=many"], "trainer.rounds"),
+        (["trainer=bc", "trainer.rounds=3"], "trainer.rounds"),
+        (["env.num_agents=[8,0]"], "env.num_agents=0 is out of range"),
+        (["env.num_agents=many"], "env.num_agents"),
+        (["env.num_agents=3.5"], "env.num_agents"),
+        (["trainer.learning_rates=[1e-3]"], "trainer.learning_rates"),
+        (["device=tpu9"], "device=tpu9"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, arguments, words):
+    done = _command("train", *arguments, folder=tmp_path)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_no_run(tmp_path):
+    done = _command("evaluate", f"run={tmp_path}", folder=tmp_path)
+    assert done.returncode == 2
+    assert "is no run folder" in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,74 @@
+"""The learner: its learning rate, its moving average, its determinism."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+
+import pytest
+import torch
+
+from modgnn_rl import make_model
+from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
+from modgnn_rl.experts import Reynolds
+from modgnn_rl.trainers.collection import Flocks
+from modgnn_rl.trainers.learner import Learner, cosine_learning_rate
+
+RATES = (3e-3, 1e-3, 1e-4)
+
+
+@pytest.fixture(scope="module")
+def flights():
+    settings = DAggerConfig(capacity=500, batch_size=64)
+    return Flocks(FlockingConfig(), settings, 8, 6, make_model("gcn", seed=0), Reynolds(), steps=40, stretch=40, seed=0)
+
+
+def _learner(**settings):
+    return Learner(make_model("pair_force", seed=0), DAggerConfig(batch_size=64, **settings), (20, 60), seed=0)
+
+
+def test_learning_rate_passes_its_three_values_without_jumps():
+    rates = [cosine_learning_rate(step, RATES, (20, 60)) for step in range(80)]
+    assert rates[0] == pytest.approx(RATES[0])
+    assert rates[20] == pytest.approx(RATES[1])
+    assert rates[60] == rates[79] == pytest.approx(RATES[2])
+    assert max(abs(a - b) for a, b in itertools.pairwise(rates)) < 2e-4
+    assert all(b <= a for a, b in itertools.pairwise(rates))
+
+
+def test_fitting_lowers_the_loss_and_the_optimiser_goes_on(flights):
+    flights.fly(1.0)
+    learner = _learner()
+    before = learner.validate(flights.buffer)
+    learner.fit(flights.buffer, 60)
+    assert learner.validate(flights.buffer) < 0.7 * before
+    assert learner.updates_done == 60
+    assert learner.learning_rate == pytest.approx(RATES[2])
+
+
+def test_what_flies_is_the_moving_average_of_the_weights(flights):
+    flights.fly(1.0)
+    learner = _learner(averaging=0.9)
+    expected = copy.deepcopy(learner.policy.state_dict())
+    for update in range(5):
+        learner.fit(flights.buffer, 1)
+        for key, value in learner.policy.state_dict().items():
+            expected[key] = value.clone() if update == 0 else 0.9 * expected[key] + 0.1 * value
+    for key, value in learner.flown.state_dict().items():
+        torch.testing.assert_close(value, expected[key])
+
+
+def test_one_seed_fixes_the_weights():
+    weights = []
+    for _ in range(2):
+        settings = DAggerConfig(capacity=500, batch_size=64)
+        learner = _learner()
+        group = Flocks(FlockingConfig(), settings, 8, 6, learner.flown, Reynolds(), steps=40, stretch=40, seed=0)
+        group.fly(0.5)
+        learner.fit(group.buffer, 5)
+        weights.append(torch.cat([parameter.flatten() for parameter in learner.flown.parameters()]))
+    assert torch.equal(*weights)
+
+
+def test_no_updates_are_no_loss(flights):
+    assert torch.isnan(torch.tensor(_learner().fit(flights.buffer, 0)))
