@@ -165,7 +165,7 @@ class _Means:
 
     def add(self, name: str, value: Tensor) -> None:
         """Add one step's values [F] or [F, N]."""
-        value = value.double().unflatten(0, (len(value), 1)).flatten(1)
+        value = value.double().reshape(len(value), -1)
         self.sums[name] = self.sums.get(name, self.zero) + value.mean(-1)
         self.squares[name] = self.squares.get(name, self.zero) + value.square().mean(-1)
         self.count[name] = self.count.get(name, 0) + 1

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from modgnn_rl.cache import AgentCache, missing
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.errors import InputError
 from modgnn_rl.tensors import clip_to_ball, pair_differences, squared_norm
 
 __all__ = ["LocalReynolds", "Reynolds", "reachable", "reynolds"]
@@ -64,7 +65,7 @@ def reynolds(
 
 
 def reachable(adjacency: Tensor, hops: int) -> Tensor:
-    """Who hears of whom over at most ``hops`` links; bool [..., N, N] -> bool [..., N, N], zero diagonal."""
+    """Who hears of whom over at most ``hops`` >= 1 links; bool [..., N, N] -> bool [..., N, N], zero diagonal."""
     reached = adjacency
     for _ in range(hops - 1):
         reached = reached | ((adjacency.float() @ reached.float()) > 0)
@@ -133,6 +134,9 @@ class LocalReynolds(Reynolds):
         is_init: key of the flag that an episode begins [..., 1].
         cache: key of the last observation [..., N, 6].
         action: key that the action [..., N, 3] is written to.
+
+    Raises:
+        InputError: on ``hops`` below 1 or fractional.
     """
 
     def __init__(
@@ -150,6 +154,8 @@ class LocalReynolds(Reynolds):
         action: NestedKey = ("agents", "expert_action"),
     ) -> None:
         super().__init__(cohesion, separation, alignment, max_speed, observation=observation, action=action)
+        if not isinstance(hops, int) or hops < 1:
+            raise InputError(f"hops={hops!r} is not a number of links to hear over; expected an integer of at least 1")
         self.hops = hops
         self.cache = cache
         self.in_keys = [observation, adjacency, is_init, cache]

@@ -168,7 +168,7 @@ def make_model(
         raise InputError(f"model '{name}' is not one of {', '.join(MODELS)}{suggestion(name, MODELS)}")
     with torch.random.fork_rng(devices=[], enabled=seed is not None):
         if seed is not None:
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)  # torch.manual_seed would also seed the accelerators
         return ModGNN(MODELS[name](hops, hidden, max_speed), **keys)
 
 

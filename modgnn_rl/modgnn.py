@@ -39,8 +39,9 @@ class ModGNNLayer(nn.Module):
         x_i(t)      = f_final( f_mid^(0)(f_pre^(0)(c_i(t))) + sum_k f_mid^(k)( sum_j f_pre^(k)(y_ij^(k)(t)) ) )
 
     A submodule that is left out is the identity. A submodule may also be a TensorDictModule with keys of its own: it
-    reads ``"data"`` (what a plain module would get) and anything under ``"own"``, the agent's own data at time t, for
-    example ``("own", "observation")``; its first out-key is the result. In f_pre, ``own`` is the receiving agent.
+    reads ``"data"`` (what a plain module would get) and anything under ``"own"``, the agent's own data at time t:
+    ``("own", "observation")``, or another name that lies beside the observation; its first out-key is the result. In
+    f_pre, ``own`` is the receiving agent.
 
     Args:
         hops: number of hops K >= 0.
@@ -100,6 +101,7 @@ class ModGNNLayer(nn.Module):
         is_init: Tensor | None = None,
         messages: Tensor | None = None,
         own: Own | None = None,
+        receivers: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Run a window of T steps; one environment step is a window with T = 1.
 
@@ -110,6 +112,8 @@ class ModGNNLayer(nn.Module):
             messages: the messages of the step before the window [*B, N, K, D]; a hop that an agent does not hold is
                 NaN. Default: nobody holds anything.
             own: further data of the agents for keyed submodules [*B, T, N, ...].
+            receivers: the agents and steps whose output is wanted, bool [*B, T, N]; the others cost nothing but their
+                messages and get zeros. Default: all.
 
         Returns:
             x [*B, T, N, O], and the messages sent at each step [*B, T, N, K, D].
@@ -118,9 +122,12 @@ class ModGNNLayer(nn.Module):
         nodes = observation.shape[:-1].numel()
         own = {key: value.reshape(nodes, *value.shape[len(batch) + 1 :]) for key, value in (own or {}).items()}
         data = _call(self.f_input, observation.reshape(nodes, -1), own)
-        total = _call(self.f_mid[0], _call(self.f_pre[0], data, own), own)
+        rows = slice(None) if receivers is None else receivers.reshape(-1).nonzero().squeeze(-1)
+        mine = {key: value[rows] for key, value in own.items()}
+        total = _call(self.f_mid[0], _call(self.f_pre[0], data[rows], mine), mine)
 
-        graph = links(adjacency)
+        wanted = links(adjacency if receivers is None else adjacency & receivers.unsqueeze(-1))
+        graph = wanted if receivers is None or self.hops < 2 else links(adjacency)
         first = data  # of start="repeat"
         sent = []
         for hop in range(1, self.hops + 1):
@@ -133,15 +140,18 @@ class ModGNNLayer(nn.Module):
             elif self.start == "repeat":
                 before, held = torch.where(held, before, first), torch.ones_like(held)
             before = torch.where(held, before, 0.0)
-            heard = graph.between(held.squeeze(-1))
-            summed = sum_over_links(self._processed(hop, before, own), heard, nodes)
-            total = total + torch.where(held, _call(self.f_mid[hop], summed, own), 0.0)
+            heard = held.squeeze(-1)
+            summed = sum_over_links(self._processed(hop, before, own), wanted.between(heard), nodes)
+            total = total + torch.where(held[rows], _call(self.f_mid[hop], summed[rows], mine), 0.0)
             if hop < self.hops:
-                data = torch.where(held, sum_over_links(self._incoming(before), heard, nodes), torch.nan)
+                sums = sum_over_links(self._incoming(before), graph.between(heard), nodes)
+                data = torch.where(held, sums, torch.nan)
                 if self.start == "repeat":
                     first = sum_over_links(self._incoming(first), graph, nodes)
 
-        output = _call(self.f_final, total, own)
+        output = _call(self.f_final, total, mine)
+        if receivers is not None:
+            output = output.new_zeros(nodes, output.shape[-1]).index_copy(0, rows, output)
         stacked = torch.stack(sent, -2) if sent else data.new_zeros(nodes, 0, data.shape[-1])
         return output.unflatten(0, observation.shape[:-1]), stacked.unflatten(0, observation.shape[:-1])
 
@@ -196,9 +206,9 @@ class ModGNN(TensorDictModuleBase):
         modules = nn.ModuleList([layers] if isinstance(layers, ModGNNLayer) else layers)
         self.layers = cast(Sequence[ModGNNLayer], modules)
         key = unravel_key(observation)
-        self._group = key[:-1] if isinstance(key, tuple) else ()
-        own = {name for layer in self.layers for name in layer.own_keys}
-        self._own_keys = {name: unravel_key((*self._group, *name)) for name in sorted(own)}
+        group = key[:-1] if isinstance(key, tuple) else ()
+        own = sorted({name for layer in self.layers for name in layer.own_keys})
+        self._own_keys = {name: key if name == ("observation",) else unravel_key((*group, *name)) for name in own}
         self.messages_key = messages
         self.in_keys: list[NestedKey] = [observation, adjacency, is_init, messages]
         self.in_keys += [name for name in self._own_keys.values() if name not in self.in_keys]
@@ -220,32 +230,48 @@ class ModGNN(TensorDictModuleBase):
         """Whether messages hold no trace of any parameter, so that stored ones stay exact while the policy learns."""
         return len(self.layers) == 1 and self.layers[0].sends_plain_data
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the actions and the messages to remember."""
+    def forward(self, tensordict: TensorDictBase, receivers: Tensor | None = None) -> TensorDictBase:
+        """Write the actions and the messages to remember.
+
+        Args:
+            tensordict: one step [*B], or a window [*B, T] in recurrent mode.
+            receivers: the agents and steps whose action is wanted, bool [*B, N] or [*B, T, N]; the others get zeros.
+                Default: all.
+        """
         observation, adjacency, is_init, messages = (tensordict.get(key) for key in self.in_keys[:4])
         own = {name: tensordict[key] for name, key in self._own_keys.items()}
         if recurrent_mode():
-            messages = None if messages is None or is_init is None else messages.select(tensordict.ndim - 1, 0)
-            output, sent = self._run(observation, adjacency, is_init, messages, own)
+            messages = None if messages is None or is_init is None else messages.select(observation.ndim - 3, 0)
+            output, sent = self._run(observation, adjacency, is_init, messages, own, receivers)
         else:
             if is_init is None and messages is None:
                 self._warn_of_no_memory()
-            time = tensordict.ndim
+            time = observation.ndim - 2
             own = {name: value.unsqueeze(time) for name, value in own.items()}
             is_init = None if is_init is None else is_init.unsqueeze(time)
-            output, sent = self._run(observation.unsqueeze(time), adjacency.unsqueeze(time), is_init, messages, own)
+            receivers = None if receivers is None else receivers.unsqueeze(time)
+            observation, adjacency = observation.unsqueeze(time), adjacency.unsqueeze(time)
+            output, sent = self._run(observation, adjacency, is_init, messages, own, receivers)
             output, sent = output.squeeze(time), sent.squeeze(time)
         return tensordict.set(self.out_keys[0], output).set(self.out_keys[1], sent)
 
     def _run(
-        self, observation: Tensor, adjacency: Tensor, is_init: Tensor | None, messages: Tensor | None, own: Own
+        self,
+        observation: Tensor,
+        adjacency: Tensor,
+        is_init: Tensor | None,
+        messages: Tensor | None,
+        own: Own,
+        receivers: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         """All layers over a window, see `ModGNNLayer.forward`."""
         is_init = None if is_init is None else is_init.squeeze(-1)
         seen, sent, first = observation, [], 0
         for layer in self.layers:
             stored = None if messages is None else messages[..., first : first + layer.hops, :]
-            output, sends = layer(seen, adjacency, is_init, stored, own)
+            # Later layers hear of everybody's outputs.
+            asked = receivers if layer is self.layers[-1] else None
+            output, sends = layer(seen, adjacency, is_init, stored, own, asked)
             seen = torch.cat((seen, output), -1)
             first += layer.hops
             sent.append(sends)

@@ -15,21 +15,18 @@ __all__ = ["imitation_loss", "random_receivers", "random_rotations", "rotate"]
 def imitation_loss(policy: ModGNN, batch: TensorDictBase, receivers: Tensor) -> Tensor:
     """Mean squared error per component between the policy's and the expert's actions at the end of each window.
 
-    Links to other agents than the receivers are dropped at the last step: their actions are not needed, and with the
-    links goes the work. The error counts the receivers alone.
+    Only the receivers' actions at the last step are computed.
 
     Args:
         policy: the policy; run over the window.
         batch: windows [S, W] with the policy's in-keys and ``("agents", "expert_action")`` [S, W, N, 3].
         receivers: the agents whose error counts, bool [S, N].
     """
-    batch = batch.copy()
-    batch["adjacency"] = batch["adjacency"].clone()
-    batch["adjacency"][:, -1] &= receivers.unsqueeze(-1)
+    wanted = torch.zeros_like(batch["agents", "controlled"])
+    wanted[:, -1] = receivers
     with set_recurrent_mode(True):
-        action = policy(batch)["agents", "action"][:, -1]
-    error = (action - batch["agents", "expert_action"][:, -1]).square().mean(-1)
-    return error[receivers].mean()
+        action = policy(batch.copy(), receivers=wanted)["agents", "action"]
+    return (action - batch["agents", "expert_action"])[wanted].square().mean()
 
 
 def random_receivers(controlled: Tensor, count: int, generator: torch.Generator) -> Tensor:

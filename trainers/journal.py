@@ -54,9 +54,9 @@ class Journal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop the progress bar; after a run that was not broken off, write the last checkpoint."""
+        """Stop the progress bar; unless something went wrong, write the last checkpoint, after Ctrl-C too."""
         self.progress.__exit__(kind, error, trace)
-        if kind is None:
+        if kind is None or issubclass(kind, KeyboardInterrupt):
             self.save()
 
     def note(self, step: int, metrics: Mapping[str, float], updates: int, **figures: float | str) -> None:

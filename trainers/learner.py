@@ -59,7 +59,10 @@ class Learner:
             loss = self._loss(self.policy, buffer.sample())
             self.optimizer.zero_grad()
             loss.backward()
-            torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.settings.max_gradient)
+            # The optimiser never steps on a gradient that is not finite.
+            torch.nn.utils.clip_grad_norm_(
+                self.policy.parameters(), self.settings.max_gradient, error_if_nonfinite=True
+            )
             self.optimizer.step()
             self.scheduler.step()
             self.averaged.update_parameters(self.policy)
