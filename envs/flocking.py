@@ -91,7 +91,7 @@ class FlockingEnv(EnvBase):
             [f"agent_{index}" for index in range(self.num_agents)]
         )
         self.generator = torch.Generator(device=self.device)
-        self._set_seed(torch.seed() % 2**31 if seed is None else seed)
+        self.generator.manual_seed(self.generator.seed() if seed is None else seed)
 
     def _make_specs(self) -> None:
         batch, agents = self.batch_size, (*self.batch_size, self.num_agents)
@@ -192,7 +192,8 @@ class FlockingEnv(EnvBase):
         Raises:
             InputError: for another device; build the environment there.
         """
-        if torch.device(device) != self.device:
+        wanted = torch.device(device)
+        if wanted.type != self.device.type or wanted.index not in (None, self.device.index):
             raise InputError(
                 f"this environment lives on {self.device} and does not move; build it with device={str(device)!r}"
             )
