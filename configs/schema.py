@@ -120,7 +120,7 @@ class BCConfig(ImitationConfig):
     name: str = setting("bc", "trainer", choices=("bc",))
     capacity: int = setting(32_000, "flock states kept for each size; the oldest go first", low=1)
     cloning_steps: int = setting(1000, "steps that the expert flies", low=1)
-    cloning_updates: int = setting(4000, "updates on its flights, for each size", low=1)
+    cloning_updates: int = setting(6000, "updates on its flights, shared by the sizes", low=1)
     held_out: int = setting(8, "flocks whose flights are kept for the validation error", low=1)
 
 
@@ -130,10 +130,10 @@ class DAggerConfig(ImitationConfig):
 
     name: str = setting("dagger", "trainer", choices=("dagger",))
     cloning_steps: int = setting(200, "steps that the expert flies at first", low=1)
-    cloning_updates: int = setting(100, "updates on its flights, for each size", low=0)
-    rounds: int = setting(84, "rounds of flying and fitting", low=0)
+    cloning_updates: int = setting(400, "updates on its flights, shared by the sizes", low=0)
+    rounds: int = setting(150, "rounds of flying and fitting", low=0)
     round_steps: int = setting(40, "steps flown in a round", low=1)
-    round_updates: int = setting(20, "updates in a round, for each size", low=1)
+    round_updates: int = setting(40, "updates in a round, shared by the sizes", low=1)
     schedule: str = setting(
         "exponential", "how the expert's share of the flying time falls", choices=("constant", "linear", "exponential")
     )
@@ -178,7 +178,7 @@ class TrainConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     seed: int = setting(0, "fixes everything that is drawn", low=0)
     device: str = setting("cpu", "where to train: cpu, cuda, cuda:1")
-    threads: int = setting(0, "threads of torch on the CPU; 0: one for each core", low=0)
+    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
     runs: str = setting("runs", "folder for the run folders")
     name: str | None = setting(None, "name of the run; null: trainer and model")
 
@@ -190,4 +190,4 @@ class EvaluateConfig:
     run: str = setting(MISSING, "run folder")
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
-    threads: int = setting(0, "threads of torch on the CPU; 0: one for each core", low=0)
+    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -43,7 +44,7 @@ def fly(policy: TensorDictModuleBase) -> dict[str, np.ndarray]:
     }
 
 
-def draw(axes: plt.Axes, flight: dict[str, np.ndarray], step: int) -> None:
+def draw(axes: Any, flight: dict[str, np.ndarray], step: int) -> None:
     """Draw one moment of a flight, in a box of 6.6 m about the centre of the flock."""
     position, adjacency = flight["position"][step], flight["adjacency"][step]
     centre = position.mean(0)

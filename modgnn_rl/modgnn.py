@@ -151,7 +151,9 @@ class ModGNNLayer(nn.Module):
 
         output = _call(self.f_final, total, mine)
         if receivers is not None:
-            output = output.new_zeros(nodes, output.shape[-1]).index_copy(0, rows, output)
+            everyone = output.new_zeros(nodes, output.shape[-1])
+            everyone[rows] = output
+            output = everyone
         stacked = torch.stack(sent, -2) if sent else data.new_zeros(nodes, 0, data.shape[-1])
         return output.unflatten(0, observation.shape[:-1]), stacked.unflatten(0, observation.shape[:-1])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -181,7 +182,7 @@ def test_nan_agent_shows_in_the_separation_of_its_flock_only() -> None:
 
 @pytest.mark.parametrize("function", [metrics.leader_distance, lambda p, leader: metrics.is_lost(p, 1.0, leader)])
 @pytest.mark.parametrize("leader", [-1, 4])
-def test_unknown_leader_is_refused(function: object, leader: int) -> None:
+def test_unknown_leader_is_refused(function: Callable[..., object], leader: int) -> None:
     with pytest.raises(InputError, match="not an agent"):
         function(torch.zeros(4, 3), leader)
 

@@ -16,7 +16,7 @@ from modgnn_rl.trainers.learner import Learner
 
 __all__ = ["bc"]
 
-ROUNDS = 40  # lines of metrics
+ROUNDS = 40  # parts of the training after each of which the loss is looked at
 
 
 def bc(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN:
@@ -37,8 +37,9 @@ def bc(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN:
     model = config.model
     policy = make_model(model.name, model.hops, model.hidden, max_speed=config.env.max_speed, seed=config.seed)
     sizes = config.env.sizes
-    total = settings.cloning_updates * len(sizes)
-    learner = Learner(policy.to(config.device), settings, (total, total), config.seed)
+    fitting = max(1, settings.cloning_updates // (ROUNDS * len(sizes)))
+    updates = ROUNDS * fitting * len(sizes)
+    learner = Learner(policy.to(config.device), settings, (updates, updates), config.seed)
     expert = Reynolds.for_env(config.env)
     flown = {"steps": settings.cloning_steps, "stretch": settings.cloning_steps}
     training = flocks_of_all_sizes(config, learner.flown, expert, **flown)
@@ -46,19 +47,17 @@ def bc(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN:
     validation = flocks_of_all_sizes(
         dataclasses.replace(config, trainer=held_out, seed=config.seed + 1_000_000), learner.flown, expert, **flown
     )
-    in_round = max(1, settings.cloning_updates // ROUNDS)
 
-    with Journal(run, logger, learner, total, settings) as journal:
+    with Journal(run, logger, learner, updates, settings) as journal:
         for group in (*training, *validation):
             group.fly(expert_share=1.0)
             group.close()
-        for step in range(0, settings.cloning_updates, in_round):
-            updates = min(in_round, settings.cloning_updates - step)
+        for index in range(ROUNDS):
             metrics = {"learning_rate": learner.learning_rate}
             for group, unseen in zip(training, validation, strict=True):
-                metrics[f"{group.num_agents}/loss"] = learner.fit(group.buffer, updates)
+                metrics[f"{group.num_agents}/loss"] = learner.fit(group.buffer, fitting)
                 metrics[f"{group.num_agents}/validation_loss"] = learner.validate(unseen.buffer)
             loss = sum(metrics[f"{size}/validation_loss"] for size in sizes) / len(sizes)
-            journal.note(learner.updates_done, metrics, updates * len(sizes), validation_loss=loss)
+            journal.note(index + 1, metrics, fitting * len(sizes), validation_loss=loss)
 
     return learner.flown

@@ -35,10 +35,10 @@ def dagger(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN
     model = config.model
     policy = make_model(model.name, model.hops, model.hidden, max_speed=config.env.max_speed, seed=config.seed)
     sizes = config.env.sizes
-    cloning = settings.cloning_updates * len(sizes)
-    in_round = settings.round_updates * len(sizes)
-    updates = cloning + settings.rounds * in_round
-    learner = Learner(policy.to(config.device), settings, (cloning, updates), config.seed)
+    cloning = settings.cloning_updates // len(sizes)
+    fitting = max(1, settings.round_updates // len(sizes))
+    updates = (cloning + settings.rounds * fitting) * len(sizes)
+    learner = Learner(policy.to(config.device), settings, (cloning * len(sizes), updates), config.seed)
     expert = Reynolds.for_env(config.env)
     flocks = flocks_of_all_sizes(config, learner.flown, expert, steps=settings.round_steps, stretch=settings.stretch)
 
@@ -46,8 +46,8 @@ def dagger(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN
         for group in flocks:
             for _ in range(settings.cloning_steps // settings.round_steps):
                 group.fly(expert_share=1.0)
-            loss = learner.fit(group.buffer, settings.cloning_updates)
-            journal.note(0, {f"{group.num_agents}/loss": loss}, settings.cloning_updates, cloned=loss)
+            loss = learner.fit(group.buffer, cloning)
+            journal.note(0, {f"{group.num_agents}/loss": loss}, cloning, cloned=loss)
 
         for index in range(settings.rounds):
             share = expert_share(
@@ -61,9 +61,9 @@ def dagger(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN
             for group in flocks:
                 flights = group.fly(share)
                 metrics |= flight_metrics(flights, str(group.num_agents))
-                metrics[f"{group.num_agents}/loss"] = learner.fit(group.buffer, settings.round_updates)
+                metrics[f"{group.num_agents}/loss"] = learner.fit(group.buffer, fitting)
             error = sum(metrics[f"{size}/error"] for size in sizes) / len(sizes)
-            journal.note(index + 1, metrics, in_round, round=f"{index + 1}/{settings.rounds}", error=error)
+            journal.note(index + 1, metrics, fitting * len(sizes), round=f"{index + 1}/{settings.rounds}", error=error)
 
     for group in flocks:
         group.close()

@@ -1,0 +1,217 @@
+"""The models: what they promise about actions, symmetries and weights."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.modules import set_recurrent_mode
+
+from modgnn_rl.errors import InputError
+from modgnn_rl.models import MODELS, BallHead, PairForce, Scale, make_model
+from modgnn_rl.modgnn import ModGNN
+
+seeds = st.integers(0, 999)
+models = pytest.mark.parametrize("name", MODELS)
+
+
+def flight(seed: int, agents: int = 5, steps: int = 4) -> tuple[Tensor, Tensor]:
+    """Observations of two flocks, float64 [2, T, N, 6], and links within 2 m, some of them one-way."""
+    generator = torch.Generator().manual_seed(seed)
+    observation = torch.randn(2, steps, agents, 6, dtype=torch.float64, generator=generator)
+    adjacency = torch.rand(2, steps, agents, agents, generator=generator) < 0.7
+    return observation, adjacency & ~torch.eye(agents, dtype=torch.bool)
+
+
+def act(policy: ModGNN, observation: Tensor, adjacency: Tensor) -> Tensor:
+    batch = observation.shape[:2]
+    window = TensorDict({"agents": {"observation": observation}, "adjacency": adjacency}, batch)
+    with set_recurrent_mode(True):
+        return policy(window)["agents", "action"]
+
+
+def random_rotation(seed: int, determinant: int) -> Tensor:
+    matrix = torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    orthogonal = torch.linalg.qr(matrix)[0]
+    return orthogonal if orthogonal.det().sign() == determinant else -orthogonal
+
+
+@models
+@given(seed=seeds, scale=st.sampled_from([0.0, 1.0, 1e3]))
+@torch.no_grad()
+def test_actions_stay_in_the_ball(name: str, seed: int, scale: float) -> None:
+    policy = make_model(name, hops=2, max_speed=0.7, seed=seed).double()
+    observation, adjacency = flight(seed)
+    speed = act(policy, scale * observation, adjacency).norm(dim=-1)
+    assert speed.isfinite().all()
+    assert speed.max() <= 0.7 * (1 + 1e-12)
+    if scale > 1 and name == "gcn":
+        assert speed.max() > 0.69
+
+
+@models
+@given(seed=seeds)
+@torch.no_grad()
+def test_absolute_position_is_hidden(name: str, seed: int) -> None:
+    policy = make_model(name, hops=2, seed=seed).double()
+    observation, adjacency = flight(seed)
+    shift = torch.tensor([20.0, -7.0, 3.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    expected = act(policy, observation, adjacency)
+    torch.testing.assert_close(act(policy, observation + shift, adjacency), expected)
+    assert not torch.allclose(act(policy, observation + shift.roll(3), adjacency), expected)  # its velocity is not
+
+
+@given(seed=seeds, hops=st.integers(1, 3), determinant=st.sampled_from([1, -1]))
+@torch.no_grad()
+def test_pair_force_turns_with_the_world(seed: int, hops: int, determinant: int) -> None:
+    policy = make_model("pair_force", hops, seed=seed, max_speed=1e3).double()
+    observation, adjacency = flight(seed)
+    rotation = random_rotation(seed, determinant)
+    turned = (observation.unflatten(-1, (2, 3)) @ rotation).flatten(-2)
+    action = act(policy, observation, adjacency)
+    assert action[:, hops:].abs().max() > 1e-3
+    torch.testing.assert_close(act(policy, turned, adjacency), action @ rotation)
+
+
+@models
+@torch.no_grad()
+def test_agents_are_interchangeable_and_of_any_number(name: str) -> None:
+    policy = make_model(name, hops=1, seed=3).double()
+    for agents in (1, 2, 9):
+        observation, adjacency = flight(0, agents)
+        order = torch.arange(agents - 1, -1, -1)
+        action = act(policy, observation, adjacency)
+        assert action.shape == (2, 4, agents, 3)
+        permuted = act(policy, observation[:, :, order], adjacency[:, :, order][..., order])
+        torch.testing.assert_close(permuted, action[:, :, order])
+
+
+@models
+@torch.no_grad()
+def test_who_hears_of_nobody_knows_its_own_velocity_only(name: str) -> None:
+    policy = make_model(name, hops=1, seed=0).double()
+    observation, _ = flight(0)
+    alone = torch.zeros(2, 4, 5, 5, dtype=torch.bool)
+    action = act(policy, observation, alone)
+    if name == "pair_force":
+        assert not action.any()
+    else:
+        moved = torch.cat((torch.randn(2, 4, 5, 3, dtype=torch.float64), observation[..., 3:]), -1)
+        torch.testing.assert_close(act(policy, moved, alone), action)
+
+
+@models
+@pytest.mark.parametrize("case", ["coincident", "at rest", "both"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_are_finite_where_lengths_vanish(name: str, case: str, dtype: torch.dtype) -> None:
+    policy = make_model(name, hops=2, seed=0).to(dtype)
+    observation, adjacency = flight(0)
+    if case != "at rest":
+        observation[..., 1, :3] = observation[..., 0, :3]
+    if case != "coincident":
+        observation[..., 3:] = 0.0
+    observation = observation.to(dtype).requires_grad_()
+    action = act(policy, observation, adjacency)
+    (action - 0.1).square().sum().backward()
+    gradients = [observation.grad, *(parameter.grad for parameter in policy.parameters())]
+    assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)
+
+
+@models
+def test_gradients_reach_every_parameter(name: str) -> None:
+    policy = make_model(name, hops=2, seed=0, max_speed=100.0).double()
+    act(policy, *flight(0)).square().sum().backward()
+    assert all(parameter.grad is not None and parameter.grad.any() for parameter in policy.parameters())
+
+
+def test_counts_of_parameters() -> None:
+    def count(name: str, hops: int, hidden: int) -> int:
+        return sum(parameter.numel() for parameter in make_model(name, hops, hidden).parameters())
+
+    def mlp(inputs: int, hidden: int, outputs: int) -> int:
+        return (inputs + 1) * hidden + (hidden + 1) * hidden + (hidden + 1) * outputs
+
+    for hops, hidden in ((1, 32), (3, 8)):
+        per_hop = mlp(6, hidden, 10) + mlp(10, hidden, 10)
+        assert count("modgnn_mlp", hops, hidden) == (hops + 1) * per_hop + mlp(10, hidden, 3)
+        assert count("gcn", hops, hidden) == (hops + 1) * 6 * 3 + 3
+        assert count("pair_force", hops, hidden) == hops * mlp(7, hidden, 3)
+
+
+@torch.no_grad()
+def test_gcn_is_linear_inside_the_ball() -> None:
+    policy = make_model("gcn", hops=2, max_speed=1e6, seed=0).double()
+    observation, adjacency = flight(0)
+    rest = act(policy, 0 * observation, adjacency)
+    once = act(policy, observation, adjacency) - rest
+    torch.testing.assert_close(act(policy, 3 * observation, adjacency) - rest, 3 * once)
+
+
+def test_pair_force_reads_the_receivers_own_velocity() -> None:
+    policy = make_model("pair_force", hops=1, seed=0, observation=("flock", "state"), action="u")
+    assert ("flock", "state") in policy.in_keys
+    assert len(policy.in_keys) == 4
+    force = PairForce().double()
+    relative, own = torch.randn(2, 7, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    moved = own + torch.tensor([1.0, 2, 3, 0, 0, 0])
+    assert torch.equal(force(relative, own), force(relative, moved))
+    assert not torch.allclose(force(relative, own), force(relative, own * 2))
+
+
+@torch.no_grad()
+def test_renamed_keys_serve_every_model() -> None:
+    observation, adjacency = flight(0)
+    for name in MODELS:
+        policy = make_model(name, seed=0, observation="state", adjacency="graph", action="u").double()
+        with set_recurrent_mode(True):
+            out = policy(TensorDict({"state": observation, "graph": adjacency}, observation.shape[:2]))
+        torch.testing.assert_close(out["u"], act(make_model(name, seed=0).double(), observation, adjacency))
+
+
+def test_an_unknown_name_is_refused_with_a_suggestion() -> None:
+    with pytest.raises(InputError, match=r"model 'pairforce' is not one of .*; did you mean 'pair_force'\?"):
+        make_model("pairforce")
+
+
+@models
+def test_a_seed_fixes_the_weights_and_leaves_the_global_generator(name: str) -> None:
+    def weights(seed: int | None) -> Tensor:
+        return nn.utils.parameters_to_vector(make_model(name, seed=seed).parameters())
+
+    before = torch.get_rng_state()
+    first = weights(7)
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.rand(3)
+    assert torch.equal(weights(7), first)
+    assert not torch.equal(weights(8), first)
+    torch.manual_seed(7)
+    assert torch.equal(weights(None), first)
+    assert not torch.equal(weights(None), first)
+
+
+def test_a_seed_leaves_the_accelerators_generators(monkeypatch: pytest.MonkeyPatch) -> None:
+    touched: list[int] = []
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", touched.append)
+    monkeypatch.setattr(torch.cuda, "manual_seed", touched.append)
+    make_model("gcn", seed=0)
+    assert not touched
+
+
+@given(seed=seeds, radius=st.floats(0.1, 10.0))
+def test_the_head_projects_onto_the_ball(seed: int, radius: float) -> None:
+    action = 3 * torch.randn(9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    projected = BallHead(radius)(action)
+    speed = action.norm(dim=-1)
+    torch.testing.assert_close(projected.norm(dim=-1), speed.clamp(max=radius))
+    torch.testing.assert_close(torch.linalg.cross(projected, action), torch.zeros_like(action))
+    assert ((projected * action).sum(-1) > 0).all()
+
+
+def test_scale_hides_the_position_and_is_no_weight() -> None:
+    data = torch.ones(2, 6)
+    assert Scale()(data)[0].tolist() == pytest.approx([0.5] * 3 + [1.4] * 3)
+    assert Scale(hide_position=True)(data)[0].tolist() == pytest.approx([0.0] * 3 + [1.4] * 3)
+    assert not Scale().state_dict()
