@@ -135,11 +135,9 @@ class ModGNNLayer(nn.Module):
             stored = None if messages is None else messages[..., hop - 1, : data.shape[-1]]
             before = _one_step_earlier(data.unflatten(0, observation.shape[:-1]), stored, is_init).flatten(0, -2)
             held = ~before.isnan().any(-1, keepdim=True)
-            if self.start == "zero":
-                before, held = before.nan_to_num(), torch.ones_like(held)
-            elif self.start == "repeat":
-                before, held = torch.where(held, before, first), torch.ones_like(held)
-            before = torch.where(held, before, 0.0)
+            before = torch.where(held, before, first if self.start == "repeat" else 0.0)
+            if self.start != "mask":
+                held = torch.ones_like(held)
             heard = held.squeeze(-1)
             summed = sum_over_links(self._processed(hop, before, own), wanted.between(heard), nodes)
             total = total + torch.where(held[rows], _call(self.f_mid[hop], summed[rows], mine), 0.0)
@@ -269,10 +267,10 @@ class ModGNN(TensorDictModuleBase):
         """All layers over a window, see `ModGNNLayer.forward`."""
         is_init = None if is_init is None else is_init.squeeze(-1)
         seen, sent, first = observation, [], 0
-        for layer in self.layers:
+        for number, layer in enumerate(self.layers, start=1):
             stored = None if messages is None else messages[..., first : first + layer.hops, :]
             # Later layers hear of everybody's outputs.
-            asked = receivers if layer is self.layers[-1] else None
+            asked = receivers if number == len(self.layers) else None
             output, sends = layer(seen, adjacency, is_init, stored, own, asked)
             seen = torch.cat((seen, output), -1)
             first += layer.hops
