@@ -93,25 +93,22 @@ class PairForce(nn.Module):
         Returns:
             force, m/s [E, 3].
         """
-        offset, drift = relative.split(3, -1)
-        own = observation[..., 3:]
-        distance = _norm(offset)
+        # Components first: sums over three numbers in a row are several times slower.
+        offset, drift = relative.movedim(-1, 0).contiguous().split(3)
+        own = observation[..., 3:].movedim(-1, 0).contiguous()
+        distance, drift_speed, own_speed = _norm(offset), _norm(drift), _norm(own)
         unit = offset / distance
-        drift_speed, own_speed = _norm(drift), _norm(own)
-        invariants = torch.cat(
-            (
-                0.7 * distance - 1.2,
-                (distance + 0.05).log(),
-                VELOCITY_SCALE * drift_speed,
-                VELOCITY_SCALE * _dot(unit, drift),
-                VELOCITY_SCALE * own_speed,
-                VELOCITY_SCALE * _dot(own, unit),
-                _dot(own, drift),
-            ),
-            -1,
+        invariants = (
+            0.7 * distance - 1.2,
+            (distance + 0.05).log(),
+            VELOCITY_SCALE * drift_speed,
+            VELOCITY_SCALE * _dot(unit, drift),
+            VELOCITY_SCALE * own_speed,
+            VELOCITY_SCALE * _dot(own, unit),
+            _dot(own, drift),
         )
-        radial, along_drift, along_own = self.network(invariants).split(1, -1)
-        return radial * unit + along_drift * drift + along_own * own
+        radial, along_drift, along_own = self.network(torch.stack(invariants, -1)).unbind(-1)
+        return (radial * unit + along_drift * drift + along_own * own).movedim(0, -1)
 
 
 def modgnn_mlp(hops: int, hidden: int, max_speed: float) -> ModGNNLayer:
@@ -180,9 +177,10 @@ def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum(-1, keepdim=True)
+    """Inner products [...] of vectors with the component first [3, ...]."""
+    return (a * b).sum(0)
 
 
 def _norm(vector: Tensor) -> Tensor:
-    """Length [..., 1], softened so that its gradient exists at zero."""
+    """Lengths [...] of vectors [3, ...], softened so that the gradient exists at zero."""
     return (_dot(vector, vector) + 1e-8).sqrt()
