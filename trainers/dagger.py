@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from modgnn_rl.configs.schema import DAggerConfig, TrainConfig
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.loggers import GuardedLogger
@@ -44,7 +46,7 @@ def dagger(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN
 
     with Journal(run, logger, learner, updates, settings) as journal:
         for group in flocks:
-            for _ in range(settings.cloning_steps // settings.round_steps):
+            for _ in range(math.ceil(settings.cloning_steps / settings.round_steps)):
                 group.fly(expert_share=1.0)
             loss = learner.fit(group.buffer, cloning)
             journal.note(0, {f"{group.num_agents}/loss": loss}, cloning, cloned=loss)
