@@ -97,7 +97,7 @@ class ImitationConfig:
     capacity: int = setting(16_000, "flock states kept for each size; the oldest go first", low=1)
     batch_size: int = setting(256, "flock states in a batch", low=1)
     receivers: int = setting(
-        8,
+        4,
         "agents of a state of 32 whose error counts in an update; at other sizes N, as many links: 32 / N times",
         low=1,
     )
@@ -131,7 +131,7 @@ class DAggerConfig(ImitationConfig):
     name: str = setting("dagger", "trainer", choices=("dagger",))
     cloning_steps: int = setting(200, "steps that the expert flies at first", low=1)
     cloning_updates: int = setting(400, "updates on its flights, shared by the sizes", low=0)
-    rounds: int = setting(150, "rounds of flying and fitting", low=0)
+    rounds: int = setting(120, "rounds of flying and fitting", low=0)
     round_steps: int = setting(40, "steps flown in a round", low=1)
     round_updates: int = setting(40, "updates in a round, shared by the sizes", low=1)
     schedule: str = setting(
