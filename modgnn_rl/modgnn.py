@@ -107,7 +107,7 @@ class ModGNNLayer(nn.Module):
 
         Args:
             observation: o [*B, T, N, F].
-            adjacency: entry i, j says that i receives from j, bool [*B, T, N, N].
+            adjacency: entry i, j, unless zero, says that i receives from j [*B, T, N, N].
             is_init: steps at which an episode begins, bool [*B, T]; default: none does.
             messages: the messages of the step before the window [*B, N, K, D]; a hop that an agent does not hold is
                 NaN. Default: nobody holds anything.
@@ -119,6 +119,7 @@ class ModGNNLayer(nn.Module):
             x [*B, T, N, O], and the messages sent at each step [*B, T, N, K, D].
         """
         *batch, _, _ = observation.shape
+        adjacency = adjacency.bool()
         nodes = observation.shape[:-1].numel()
         own = {key: value.reshape(nodes, *value.shape[len(batch) + 1 :]) for key, value in (own or {}).items()}
         data = _call(self.f_input, observation.reshape(nodes, -1), own)

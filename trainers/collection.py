@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer
+from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRobinWriter
 
 from modgnn_rl.configs.schema import FlockingConfig, ImitationConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
@@ -70,8 +70,10 @@ class Flocks:
             no_cuda_sync=True,
         )
         self.flights: Iterator[TensorDictBase] = iter(self.collector)
+        # Not compilable ones would share their counters between processes, and start one of their own for that.
         self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(settings.capacity, device=device),
+            storage=LazyTensorStorage(settings.capacity, device=device, compilable=True),
+            writer=RoundRobinWriter(compilable=True),
             sampler=RandomSampler(),
             batch_size=settings.batch_size,
             generator=torch.Generator().manual_seed(seed + 1),
