@@ -14,6 +14,7 @@ from omegaconf import MISSING
 from modgnn_rl.settings import setting
 
 __all__ = [
+    "REFERENCE_SIZE",
     "BCConfig",
     "DAggerConfig",
     "EvaluateConfig",
@@ -23,7 +24,16 @@ __all__ = [
     "LoggerConfig",
     "ModelConfig",
     "TrainConfig",
+    "as_list",
 ]
+
+
+REFERENCE_SIZE = 32  # the flock size to which start_radius, num_envs and receivers refer
+
+
+def as_list(value: int | list[int]) -> list[int]:
+    """A setting that is one number or a list of them, as a list."""
+    return [value] if isinstance(value, int) else list(value)
 
 
 @dataclass
@@ -73,7 +83,7 @@ class FlockingConfig:
     @property
     def sizes(self) -> list[int]:
         """``num_agents`` as a list."""
-        return [self.num_agents] if isinstance(self.num_agents, int) else list(self.num_agents)
+        return as_list(self.num_agents)
 
 
 @dataclass
@@ -135,7 +145,9 @@ class DAggerConfig(ImitationConfig):
     round_steps: int = setting(40, "steps flown in a round", low=1)
     round_updates: int = setting(40, "updates in a round, shared by the sizes", low=1)
     schedule: str = setting(
-        "exponential", "how the expert's share of the flying time falls", choices=("constant", "linear", "exponential")
+        "exponential",
+        "how the expert's share falls until it flies no more",
+        choices=("constant", "linear", "exponential"),
     )
     expert_share: float = setting(0.6, "the expert's share in the first round", low=0, high=1)
     share_decay: float = setting(0.6, "exponential schedule: factor between two rounds", low=0, high=1)
@@ -164,7 +176,7 @@ class EvaluationConfig:
     num_flocks: int = setting(100, "fresh flocks that each policy flies", low=2)
     num_agents: Any = setting(None, "agents in a flock, or a list of sizes; null: as in training", low=1, whole=True)
     steps: int = setting(1000, "steps of a flight", low=4)
-    seed: int = setting(1_000_000, "seed of starts and leaders, apart from those of training", low=0)
+    seed: int = setting(1_000_000, "seed of starts and leaders, apart from those of training", low=0, high=2**32)
 
 
 @dataclass
@@ -176,7 +188,7 @@ class TrainConfig:
     trainer: Any = MISSING
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    seed: int = setting(0, "fixes everything that is drawn", low=0)
+    seed: int = setting(0, "fixes everything that is drawn", low=0, high=2**32)
     device: str = setting("cpu", "where to train: cpu, cuda, cuda:1")
     threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
     runs: str = setting("runs", "folder for the run folders")

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, MarlGroupMapType
 
-from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig
 from modgnn_rl.envs.physics import Physics, TorchPhysics
 from modgnn_rl.envs.rewards import flocking_reward
 from modgnn_rl.envs.starts import uniform_ball
@@ -122,7 +122,7 @@ class FlockingEnv(EnvBase):
         mask = self.done_spec["done"].one() if mask is None else mask
         rows = mask.view(-1).nonzero().view(-1)
         config, size = self.config, self.num_agents
-        radius = config.start_radius * (size / 32) ** (1 / 3)
+        radius = config.start_radius * (size / REFERENCE_SIZE) ** (1 / 3)
         start = uniform_ball(len(rows), size, radius, config.start_distance, generator=self.generator, dtype=self.dtype)
         self.physics.reset(rows, start, torch.zeros_like(start))
         self.leader_velocity = self.leader_velocity.masked_fill(mask, 0.0)

@@ -1,4 +1,4 @@
-"""modgnn_rl: imitation and reinforcement learning of robot swarms with ModGNN, on TorchRL.
+"""modgnn_rl: imitation learning of robot swarms with ModGNN, on TorchRL.
 
 The names below are imported when they are first used, so that ``python -m modgnn_rl.train --help`` need not wait for
 torch.

@@ -43,7 +43,7 @@ class Flights:
         cohesion: diameter of the smallest enclosing sphere, m.
         separation: distance to the nearest neighbour, m.
         squares: means of the squares of the last three, for standard deviations over time, agents and flocks.
-        smallest_distance: smallest distance of two agents in the whole flight, m.
+        smallest_distance: smallest distance of two agents at any step, m.
         near_collisions: mean number of touching pairs.
         reward: reward of an agent, summed over the flight.
         lost: nobody is within range of the leader at the end, bool.

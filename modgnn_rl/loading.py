@@ -61,8 +61,8 @@ def stored_world(run: RunFolder) -> FlockingConfig:
 def _stored(run: RunFolder, group: str, schema: type) -> Any:
     """Read one group of a stored configuration back into its dataclass."""
     try:
-        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), run.config.get(group, {})))
-    except OmegaConfBaseException as error:
+        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), run.config[group]))
+    except (KeyError, OmegaConfBaseException) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{group} in {run.path / 'config.yaml'} is not as training wrote it: {reason}") from error
     check(settings, group)

@@ -71,9 +71,10 @@ class Zero(nn.Module):
 class PairForce(nn.Module):
     r"""The force between two agents, equivariant to rotations and reflections.
 
-    With the relative position r u (distance r, unit vector u), the relative velocity w and the receiver's own velocity
-    v, a small network maps the invariants to (a, b, c), and the force is ``a u + b w + c v``. Forces are summed over
-    the neighbours, so that a policy trained at one flock size flies at others.
+    With the relative position r u (distance r, unit vector u) and relative velocity w that hop 1 of the Laplacian
+    brings (further hops bring sums of such differences, which are treated alike), and the receiver's own velocity v, a
+    small network maps the invariants to (a, b, c), and the force is ``a u + b w + c v``. Forces are summed over the
+    neighbours, so that a policy trained at one flock size flies at others.
 
     Args:
         hidden: width of the network's two hidden layers.

@@ -19,7 +19,7 @@ from torch.nn.functional import pad
 from torchrl.modules import recurrent_mode
 
 from modgnn_rl.cache import AgentCache, missing
-from modgnn_rl.communication import Laplacian, links, sum_over_links
+from modgnn_rl.communication import Adjacency, Laplacian, links, sum_over_links
 from modgnn_rl.errors import InputError
 
 __all__ = ["ModGNN", "ModGNNLayer"]
@@ -38,7 +38,7 @@ class ModGNNLayer(nn.Module):
         m_i^(k)(t)  = sum_j y_ij^(k)(t),                                        k = 1..K-1
         x_i(t)      = f_final( f_mid^(0)(f_pre^(0)(c_i(t))) + sum_k f_mid^(k)( sum_j f_pre^(k)(y_ij^(k)(t)) ) )
 
-    A submodule that is left out is the identity. A submodule may also be a TensorDictModule with keys of its own: it
+    A submodule that is left out is the identity. Each but f_com may be a TensorDictModule with keys of its own: it
     reads ``"data"`` (what a plain module would get) and anything under ``"own"``, the agent's own data at time t:
     ``("own", "observation")``, or another name that lies beside the observation; its first out-key is the result. In
     f_pre, ``own`` is the receiving agent.
@@ -46,7 +46,7 @@ class ModGNNLayer(nn.Module):
     Args:
         hops: number of hops K >= 0.
         f_input: encodes the observation.
-        f_com: ``f_com(sender, receiver)``, applied to each link; default: the Laplacian, incoming minus own.
+        f_com: ``f_com(sender, receiver)`` [E, D], applied to each link; default: the Laplacian, incoming minus own.
         f_pre: applied to each incoming datum before the sum over neighbours; one module for all hops, or a list of
             K + 1 (``None`` in it is the identity).
         f_mid: applied to each hop's sum; one module or a list of K + 1.
@@ -55,7 +55,8 @@ class ModGNNLayer(nn.Module):
             the data are zero; ``repeat``: the first observation and graph are repeated backwards.
 
     Raises:
-        InputError: on a negative or fractional ``hops``, a list of the wrong length, or an unknown ``start``.
+        InputError: on a negative or fractional ``hops``, a list of the wrong length, an unknown ``start``, or an f_com
+            with keys of its own.
     """
 
     def __init__(
@@ -74,6 +75,8 @@ class ModGNNLayer(nn.Module):
             raise InputError(f"hops={hops!r} is not a number of hops; expected an integer of at least 0")
         if start not in STARTS:
             raise InputError(f"start={start!r} is not one of {', '.join(STARTS)}")
+        if isinstance(f_com, TensorDictModuleBase):
+            raise InputError("f_com takes two tensors, f_com(sender, receiver), and cannot have keys of its own")
         self.hops = hops
         self.start = start
         self.f_input = _or_identity(f_input)
@@ -91,8 +94,8 @@ class ModGNNLayer(nn.Module):
 
     @property
     def sends_plain_data(self) -> bool:
-        """Whether f_input and f_com are free of parameters, so that a stored message never grows stale."""
-        return not any(True for module in (self.f_input, self.f_com) for _ in module.parameters())
+        """Whether messages are sums of observations, so that stored ones never grow stale and turn as vectors do."""
+        return isinstance(self.f_input, nn.Identity) and isinstance(self.f_com, (Laplacian, Adjacency))
 
     def forward(
         self,
@@ -144,6 +147,11 @@ class ModGNNLayer(nn.Module):
             total = total + torch.where(held[rows], _call(self.f_mid[hop], summed[rows], mine), 0.0)
             if hop < self.hops:
                 sums = sum_over_links(self._incoming(before), graph.between(heard), nodes)
+                if sums.shape != data.shape:
+                    raise InputError(
+                        f"f_com turns {data.shape[-1]} features into {sums.shape[-1]}; with several hops it must keep "
+                        "their number"
+                    )
                 data = torch.where(held, sums, torch.nan)
                 if self.start == "repeat":
                     first = sum_over_links(self._incoming(first), graph, nodes)
@@ -228,7 +236,7 @@ class ModGNN(TensorDictModuleBase):
 
     @property
     def sends_plain_data(self) -> bool:
-        """Whether messages hold no trace of any parameter, so that stored ones stay exact while the policy learns."""
+        """Whether messages are sums of observations, so that stored ones stay exact while the policy learns."""
         return len(self.layers) == 1 and self.layers[0].sends_plain_data
 
     def forward(self, tensordict: TensorDictBase, receivers: Tensor | None = None) -> TensorDictBase:
@@ -245,7 +253,7 @@ class ModGNN(TensorDictModuleBase):
             messages = None if messages is None or is_init is None else messages.select(observation.ndim - 3, 0)
             output, sent = self._run(observation, adjacency, is_init, messages, own, receivers)
         else:
-            if is_init is None and messages is None:
+            if is_init is None:
                 self._warn_of_no_memory()
             time = observation.ndim - 2
             own = {name: value.unsqueeze(time) for name, value in own.items()}
@@ -287,8 +295,8 @@ class ModGNN(TensorDictModuleBase):
         if self.hops and not self._warned:
             self._warned = True
             warnings.warn(
-                f"ModGNN finds neither '{self.in_keys[2]}' nor '{self.messages_key}' and hears of nobody: append "
-                "InitTracker() and policy.make_tensordict_primer() to the environment",
+                f"ModGNN finds no '{self.in_keys[2]}' and cannot tell where episodes begin: append InitTracker() and "
+                "policy.make_tensordict_primer() to the environment",
                 stacklevel=3,
             )
 

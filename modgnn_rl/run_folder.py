@@ -51,18 +51,19 @@ class RunFolder:
 
         Args:
             root: where the runs lie; made when missing.
-            name: what the run is called: letters, digits and ``_ . + = -``.
+            name: what the run is called: letters, digits and ``_ . + -``.
             config_yaml: the resolved configuration.
 
         Raises:
             InputError: the name is no name for a folder, or the root cannot be written; nothing is left behind.
         """
-        if not re.fullmatch(r"[A-Za-z0-9][\w.+=-]*", name, re.ASCII):
-            raise InputError(f"name={name!r} cannot name a folder: use letters, digits and _ . + = - only")
+        if not re.fullmatch(r"[A-Za-z0-9][\w.+-]*", name, re.ASCII):
+            raise InputError(f"name={name!r} cannot name a folder: use letters, digits and _ . + - only")
         root = Path(root)
-        missing = [folder for folder in (root, *root.parents) if not folder.exists()]
+        missing: list[Path] = []
         path = None
         try:
+            missing = [folder for folder in (root, *root.parents) if not folder.exists()]
             root.mkdir(parents=True, exist_ok=True)
             path = _make_unique(root / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{name}")
             write_atomically(path / "config.yaml", f"{_HEADER}schema_version: {SCHEMA_VERSION}\n{config_yaml}")

@@ -70,6 +70,8 @@ def check(config: Any, path: str = "") -> None:
         if dataclasses.is_dataclass(value):
             check(value, name)
         elif "doc" in field.metadata:
+            if value is None and field.default is None:
+                continue
             _check_list(name, value, field.metadata)
 
 
@@ -89,10 +91,12 @@ def _check_value(name: str, value: Any, rule: Any) -> None:
     if choices is not None and value not in choices:
         hint = suggestion(str(value), [str(choice) for choice in choices])
         raise InputError(f"{name}={value} is not one of {', '.join(map(str, choices))}{hint}")
-    if rule["whole"] and value is not None and (isinstance(value, bool) or not isinstance(value, int)):
+    if rule["whole"] and (isinstance(value, bool) or not isinstance(value, int)):
         raise InputError(f"{name}={value} is not a whole number or a list of them ({rule['doc']})")
-    if value is None or isinstance(value, (str, bool)) or not isinstance(value, (int, float)):
+    if all(rule[bound] is None for bound in ("low", "above", "high")):
         return
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f"{name}={value} is not a number ({rule['doc']})")
     if math.isnan(value):
         raise InputError(f"{name} is not a number; expected {rule['doc']}")
     bounds = (

@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation import Flights
 from modgnn_rl.statistics import paired_difference, summarise
 
-__all__ = ["as_json", "as_markdown", "summarise_flights"]
+__all__ = ["as_markdown", "read_tables", "summarise_flights"]
 
 YARDSTICK = "LocalReynolds(hops=1)"
 SUMMARISED = ("error", "leader_distance", "cohesion", "separation", "smallest_distance", "near_collisions", "reward")
+ERROR_HEADER = ("flown by", "error", "median", "by quarter", "lost", "diverged")
+SHAPE_HEADER = ("flown by", "leader distance", "cohesion", "separation", "smallest", "touching")
 NOTE = """\
-Error: mean squared error of the action against the expert's, per component, over the agents that the policy flies
-(m^2/s^2), with a 95 % confidence interval over flocks; its median over flocks; its mean in the four quarters of the
-flight. Leader distance, cohesion (diameter of the smallest enclosing sphere) and separation (distance to the nearest
-neighbour) in m: mean and standard deviation over flocks and time (separation: and agents). Smallest: the smallest
-distance of any two agents in any flight, m. Lost: share of flocks in which nobody hears the leader at the end.
-Diverged: share of flocks in which an agent strayed beyond env.max_distance. All rows fly from the same starts behind
-the same leaders, each to the end."""
+All rows fly from the same starts behind the same leaders, each to the end. Mean ± standard deviation over flocks
+[95 % confidence interval of the mean]. Error: mean squared error of the action against the expert's, per component,
+over the agents that the policy flies, m^2/s^2; with its median over flocks and its mean in the quarters of the flight.
+Lost: share of flocks in which nobody hears the leader at the end. Diverged: share of flocks in which an agent strayed
+beyond env.max_distance. Leader distance: from the leader to the centre of mass of the others. Cohesion: diameter of the
+smallest enclosing sphere. Separation: distance to the nearest neighbour. Smallest: the smallest distance of any two
+agents in any flight. Touching: pairs within env.collision_distance, mean over time. All distances in m."""
 
 
 def summarise_flights(flights: Mapping[str, Flights], seed: int) -> dict[str, Any]:
@@ -44,7 +48,7 @@ def summarise_flights(flights: Mapping[str, Flights], seed: int) -> dict[str, An
         row: dict[str, Any] = {}
         for metric in SUMMARISED:
             values = getattr(flight, metric).double().cpu().numpy()
-            # A flock of one has no neighbour to be near or far from.
+            # A flock of one has nobody that the policy flies, and no neighbour.
             row[metric] = dataclasses.asdict(summarise(values, rng=rng)) if np.isfinite(values).all() else None
         for metric, squares in flight.squares.items():
             if row[metric] is not None:
@@ -54,34 +58,50 @@ def summarise_flights(flights: Mapping[str, Flights], seed: int) -> dict[str, An
         row["lost"] = float(flight.lost.double().mean())
         row["diverged"] = float(flight.diverged.double().mean())
         if YARDSTICK in flights and name != YARDSTICK:
-            errors = (f.error.double().cpu().numpy() for f in (flight, flights[YARDSTICK]))
-            row["error_minus_local"] = dataclasses.asdict(paired_difference(*errors, rng=rng))
+            mine, local = (f.error.double().cpu().numpy() for f in (flight, flights[YARDSTICK]))
+            if row["error"] is not None:
+                row["error_minus_local"] = dataclasses.asdict(paired_difference(mine, local, rng=rng))
         table[name] = row
     return table
 
 
-def as_json(tables: Mapping[int, Mapping[str, Any]], about: Mapping[str, Any]) -> str:
-    """All tables, by number of agents, with what they were made from, as JSON."""
-    return json.dumps({**about, "tables": {str(agents): table for agents, table in tables.items()}}, indent=2) + "\n"
+def read_tables(file: Path) -> dict[str, Any]:
+    """The tables, by number of agents, that an evaluation left in a file; none where there is no such file.
+
+    Raises:
+        InputError: the file is not what an evaluation writes.
+    """
+    try:
+        tables = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+        return {str(int(size)): {**entry, "rows": dict(entry["rows"])} for size, entry in tables.items()}
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InputError(f"{file} is not as an evaluation wrote it; delete it and evaluate again") from error
 
 
-def as_markdown(tables: Mapping[int, Mapping[str, Any]], title: str) -> str:
-    """All tables, by number of agents, as a Markdown page."""
+def as_markdown(tables: Mapping[str, Any], title: str) -> str:
+    """Tables, by number of agents, as a Markdown page that also reads well on a terminal.
+
+    Args:
+        tables: for each number of agents the flights it was made of (``num_flocks``, ``steps``) and its ``rows``, as
+            made by `summarise_flights`.
+        title: heading of the page.
+    """
     parts = [f"# {title}"]
-    for agents, table in tables.items():
-        parts.append(f"## {agents} agents\n\n" + markdown_table(table))
-    parts.append(NOTE)
-    return "\n\n".join(parts) + "\n"
+    for size, table in tables.items():
+        rows = table["rows"]
+        errors = [ERROR_HEADER, *([name, *_error_cells(row)] for name, row in rows.items())]
+        shapes = [SHAPE_HEADER, *([name, *_shape_cells(row)] for name, row in rows.items())]
+        parts += [
+            f"## {size} agents, {table['num_flocks']} flights of {table['steps']} steps",
+            _grid(errors),
+            _grid(shapes),
+        ]
+    return "\n\n".join([*parts, NOTE]) + "\n"
 
 
-def markdown_table(table: Mapping[str, Any]) -> str:
-    """One table in Markdown, aligned so that it also reads well on a terminal."""
-    header = [
-        *("flown by", "error", "95 % interval", "median", "by quarter", "leader distance"),
-        *("cohesion", "separation", "smallest", "lost", "diverged"),
-    ]
-    rows = [header, *([name, *_cells(row)] for name, row in table.items())]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
+def _grid(rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; the first row is the header."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
     ]
@@ -89,13 +109,27 @@ def markdown_table(table: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _cells(row: Mapping[str, Any]) -> list[str]:
-    error = row["error"]
-    figures = [f"{error['mean']:.3f}", f"{error['low']:.3f} to {error['high']:.3f}", f"{error['median']:.3f}"]
-    figures.append(" ".join(f"{value:.3f}".removeprefix("0") for value in row["error_by_quarter"]))
-    for metric in ("leader_distance", "cohesion", "separation"):
-        entry = row[metric]
-        figures.append("-" if entry is None else f"{entry['mean']:.2f} ± {entry['std_over_time']:.2f}")
-    smallest = row["smallest_distance_ever"]
-    figures.append(f"{smallest:.2f}" if np.isfinite(smallest) else "-")
-    return [*figures, f"{row['lost']:.0%}", f"{row['diverged']:.0%}"]
+def _error_cells(row: Mapping[str, Any]) -> list[str]:
+    if row["error"] is None:
+        return ["-"] * (len(ERROR_HEADER) - 1)
+    quarters = " ".join(f"{value:.3f}".removeprefix("0") for value in row["error_by_quarter"])
+    shares = [f"{row[name]:.0%}" for name in ("lost", "diverged")]
+    return [_spread(row["error"], 3), f"{row['error']['median']:.3f}", quarters, *shares]
+
+
+def _shape_cells(row: Mapping[str, Any]) -> list[str]:
+    cells = [_spread(row[metric], 2) for metric in ("leader_distance", "cohesion", "separation")]
+    alone = row["smallest_distance"] is None
+    return [*cells, "-" if alone else f"{row['smallest_distance_ever']:.2f}", _mean(row["near_collisions"])]
+
+
+def _spread(entry: Mapping[str, float] | None, digits: int) -> str:
+    """Mean ± standard deviation [confidence interval]."""
+    if entry is None:
+        return "-"
+    mean, std, low, high = (f"{entry[key]:.{digits}f}" for key in ("mean", "std", "low", "high"))
+    return f"{mean} ± {std} [{low}, {high}]"
+
+
+def _mean(entry: Mapping[str, float] | None) -> str:
+    return "-" if entry is None else f"{entry['mean']:.2f}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, TrainConfig
 
@@ -12,7 +14,7 @@ def main(config: TrainConfig) -> None:
 
     run = train(config)
     print(f"Policy, metrics and table are in {run.path}")
-    print(f"Next: python -m modgnn_rl.evaluate run={run.path} evaluation.num_agents=[8,16,32,64]")
+    print(f"Next: python -m modgnn_rl.evaluate {shlex.quote(f'run={run.path}')} 'evaluation.num_agents=[8,16,64]'")
 
 
 if __name__ == "__main__":

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import sys
 from typing import Any
 
 import torch
 from omegaconf import OmegaConf
 
-from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig
+from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation import evaluate
 from modgnn_rl.loading import load_policy, stored_world
 from modgnn_rl.loggers import check_logger, make_logger
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.table import as_json, as_markdown, summarise_flights
+from modgnn_rl.settings import check
+from modgnn_rl.table import as_markdown, read_tables, summarise_flights
 from modgnn_rl.trainers.bc import bc
 from modgnn_rl.trainers.dagger import dagger
+from modgnn_rl.trainers.setup import check_training
 
 __all__ = ["TRAINERS", "evaluate_policy", "evaluate_run", "prepare_torch", "train"]
 
@@ -28,26 +32,34 @@ def train(config: TrainConfig) -> RunFolder:
     """Train a policy, evaluate it, and leave everything in a new run folder.
 
     Raises:
-        InputError: a device or a logger that this machine does not have; nothing is created then.
+        InputError: a bad setting, or a device or a logger that this machine does not have; nothing is created then.
     """
+    check(config)
     prepare_torch(config.device, config.threads)
     check_logger(config.logger)
+    check_training(config)
     name = config.name or f"{config.trainer.name}-{config.model.name}"
     run = RunFolder.create(config.runs, name, OmegaConf.to_yaml(OmegaConf.structured(config)))
-    print(f"Training in {run.path}")
+    print(f"Training in {run.path}", flush=True)
     logger = make_logger(config.logger, run)
-    policy = TRAINERS[config.trainer.name](config, run, logger)
-    sizes = _sizes(config.evaluation, config.env)
-    tables = evaluate_policy(run, policy, config.env, config.evaluation, sizes, config.device)
-    errors = {
-        f"evaluation/{size}/{row}/error": figures["error"]["mean"]
-        for size, table in tables.items()
-        for row, figures in table.items()
-    }
-    logger.log(int(run.read_metrics()[-1]["step"]), errors)
-    where = logger.close()
-    if where:
-        print(where)
+    try:
+        policy = TRAINERS[config.trainer.name](config, run, logger)
+        sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
+        tables = evaluate_policy(run, policy, config.env, config.evaluation, sizes, config.device)
+        errors = {
+            f"evaluation/{size}/{row}/error": figures["error"]["mean"]
+            for size, table in tables.items()
+            for row, figures in table.items()
+            if figures["error"] is not None
+        }
+        logger.log(int(run.read_metrics()[-1]["step"]), errors)
+    except KeyboardInterrupt:
+        print(f"Stopped; the policy so far is in {run.path}", file=sys.stderr)
+        raise
+    finally:
+        where = logger.close()
+        if where:
+            print(where)
     return run
 
 
@@ -60,6 +72,8 @@ def evaluate_policy(
     device: str,
 ) -> dict[int, dict[str, Any]]:
     """Fly a run's policy and the reference policies, and write the table of each size into the run folder.
+
+    Tables of other sizes that the folder holds already are kept.
 
     Returns:
         for each number of agents, the table that `modgnn_rl.table.summarise_flights` makes.
@@ -76,25 +90,28 @@ def evaluate_policy(
             device=device,
         )
         tables[size] = summarise_flights(flights, settings.seed)
-    about = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
-    text = as_markdown(tables, f"{run.path.name}: {settings.num_flocks} flights of {settings.steps} steps")
-    run.write("evaluation.json", as_json(tables, about))
-    run.write("evaluation.md", text)
-    print(f"\n{text}")
+    flown = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
+    new = {str(size): {**flown, "rows": table} for size, table in tables.items()}
+    print(f"\n{as_markdown(new, run.path.name)}", flush=True)
+    file = run.path / "evaluation.json"
+    entries = sorted({**read_tables(file), **new}.items(), key=lambda entry: int(entry[0]))
+    run.write(file.name, json.dumps(dict(entries), indent=2) + "\n")
+    run.write("evaluation.md", as_markdown(dict(entries), run.path.name))
     return tables
 
 
 def evaluate_run(config: EvaluateConfig) -> RunFolder:
-    """Evaluate the policy of a finished run.
+    """Evaluate the policy of a run.
 
     Raises:
-        InputError: no such run, no readable policy in it, or no such device.
+        InputError: a bad setting, no such run, no readable policy in it, or no such device.
     """
+    check(config)
     prepare_torch(config.device, config.threads)
     policy = load_policy(config.run, device=config.device)
     run = RunFolder.open(config.run)
     world = stored_world(run)
-    sizes = _sizes(config.evaluation, world)
+    sizes = as_list(config.evaluation.num_agents or world.num_agents)
     evaluate_policy(run, policy, world, config.evaluation, sizes, config.device)
     return run
 
@@ -113,10 +130,3 @@ def prepare_torch(device: str, threads: int) -> None:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise InputError(f"device={device} cannot be used ({reason}); device=cpu works everywhere") from error
-
-
-def _sizes(settings: EvaluationConfig, world: FlockingConfig) -> list[int]:
-    """The flock sizes to evaluate: those asked for, else those of training."""
-    if settings.num_agents is None:
-        return world.sizes
-    return [settings.num_agents] if isinstance(settings.num_agents, int) else list(settings.num_agents)

@@ -10,8 +10,9 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation import evaluate, fly, reference_policies
-from modgnn_rl.table import as_json, as_markdown, summarise_flights
+from modgnn_rl.table import as_markdown, read_tables, summarise_flights
 
 FLIGHT = {"num_agents": 6, "num_flocks": 4, "steps": 40, "seed": 3}
 
@@ -67,9 +68,10 @@ def test_a_diverging_flock_is_flown_to_the_end_and_counted():
     assert flight.lost.all()
 
 
-def test_a_single_agent_has_a_table_too():
-    flights = evaluate({}, FlockingConfig(), num_agents=2, num_flocks=3, steps=8, seed=0)
-    assert "| expert" in as_markdown({2: summarise_flights(flights, 0)}, "two")
+@pytest.mark.parametrize("agents", [1, 2])
+def test_the_smallest_flocks_have_a_table_too(agents):
+    flights = evaluate({}, FlockingConfig(), num_agents=agents, num_flocks=3, steps=8, seed=0)
+    assert "| expert" in as_markdown(_tables(flights, agents), "few")
 
 
 def test_table_gives_mean_median_spread_and_paired_difference(flights):
@@ -84,10 +86,26 @@ def test_table_gives_mean_median_spread_and_paired_difference(flights):
     assert "error_minus_local" not in table["LocalReynolds(hops=1)"]
 
 
-def test_json_and_markdown_hold_every_row(flights):
-    tables = {6: summarise_flights(flights, seed=0)}
-    parsed = json.loads(as_json(tables, {"steps": 40}))
-    assert parsed["steps"] == 40
-    assert set(parsed["tables"]["6"]) == set(flights)
-    text = as_markdown(tables, "title")
-    assert all(f"| {name} " in text for name in flights)
+def test_markdown_holds_every_row(flights):
+    text = as_markdown(_tables(flights, 6), "title")
+    assert all(text.count(f"| {name} ") == 2 for name in flights)
+    assert "## 6 agents, 4 flights of 40 steps" in text
+
+
+def test_tables_are_read_back(flights, tmp_path):
+    file = tmp_path / "evaluation.json"
+    assert read_tables(file) == {}
+    file.write_text(json.dumps(_tables(flights, 6)))
+    assert read_tables(file)["6"]["rows"]["gcn"] == summarise_flights(flights, seed=0)["gcn"]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}]", '{"six": {"rows": {}}}', '{"6": 1}', '{"6": {}}'])
+def test_a_damaged_table_is_refused(text, tmp_path):
+    file = tmp_path / "evaluation.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match="not as an evaluation wrote it"):
+        read_tables(file)
+
+
+def _tables(flights, agents):
+    return {str(agents): {"num_flocks": 4, "steps": 40, "rows": summarise_flights(flights, seed=0)}}

@@ -325,7 +325,7 @@ def random_step(window: TensorDict) -> TensorDict:
 def test_forgetfulness_warns_once() -> None:
     data = random_data(2, agents=3).exclude("is_init")
     policy = policies()["full"]
-    with pytest.warns(UserWarning, match=r"hears of nobody: append InitTracker\(\)"):
+    with pytest.warns(UserWarning, match=r"where episodes begin: append InitTracker\(\)"):
         policy(data)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -40,7 +40,7 @@ def _config(runs, trainer, **others):
 
 
 def _dagger(**settings):
-    small = {"cloning_steps": 10, "cloning_updates": 3, "rounds": 3, "round_steps": 5, "round_updates": 2}
+    small = {"cloning_steps": 10, "cloning_updates": 4, "rounds": 3, "round_steps": 5, "round_updates": 2}
     return DAggerConfig(**{**SMALL, **small, **settings})
 
 
@@ -58,7 +58,7 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
     for name in ("error", "loss", "leader_distance", "cohesion", "separation", "smallest_distance"):
         assert f"5/{name}" in metrics[-1]
     assert list(run.checkpoints.iterdir())
-    table = json.loads((run.path / "evaluation.json").read_text())["tables"]["5"]
+    table = json.loads((run.path / "evaluation.json").read_text())["5"]["rows"]
     rows = ["pair_force", "expert", "LocalReynolds(hops=2)", "LocalReynolds(hops=1)", "zero action"]
     assert list(table) == rows
     assert all(row in (run.path / "evaluation.md").read_text() for row in rows)
@@ -83,7 +83,8 @@ def test_evaluation_repeats_what_training_ended_with(run):
 def test_evaluation_at_other_sizes(run):
     settings = EvaluationConfig(num_flocks=2, steps=4, num_agents=[3, 7])
     evaluate_run(EvaluateConfig(run=str(run.path), evaluation=settings, threads=1))
-    assert list(json.loads((run.path / "evaluation.json").read_text())["tables"]) == ["3", "7"]
+    tables = json.loads((run.path / "evaluation.json").read_text())
+    assert {size: table["num_flocks"] for size, table in tables.items()} == {"3": 2, "5": 3, "7": 2}
 
 
 def test_one_seed_fixes_a_run(tmp_path):
@@ -97,17 +98,17 @@ def test_one_seed_fixes_a_run(tmp_path):
 
 @pytest.mark.parametrize("model", ["modgnn_mlp", "gcn", "pair_force"])
 def test_behaviour_cloning_of_several_sizes(tmp_path, model):
-    trainer = BCConfig(**SMALL, cloning_steps=30, cloning_updates=10, held_out=2)
+    trainer = BCConfig(**SMALL, cloning_steps=30, cloning_updates=82, held_out=2)
     env = FlockingConfig(num_agents=[3, 6])
     run = train(_config(tmp_path, trainer, env=env, model=ModelConfig(name=model, hops=2, hidden=8)))
     assert {"3/validation_loss", "6/validation_loss"} <= set(run.read_metrics()[-1])
-    assert list(json.loads((run.path / "evaluation.json").read_text())["tables"]) == ["3", "6"]
+    assert list(json.loads((run.path / "evaluation.json").read_text())) == ["3", "6"]
 
 
 @pytest.mark.slow  # about three minutes
 def test_dagger_learns_to_fly_better_than_the_local_expert(tmp_path):
     run = train(_config(tmp_path, DAggerConfig(), env=FlockingConfig(), evaluation=EvaluationConfig()))
-    table = json.loads((run.path / "evaluation.json").read_text())["tables"]["32"]
+    table = json.loads((run.path / "evaluation.json").read_text())["32"]["rows"]
     assert table["pair_force"]["error"]["mean"] < 0.09
     assert table["pair_force"]["error_minus_local"]["high"] < 0
 
@@ -141,8 +142,11 @@ def _command(module, *arguments, folder):
         (["trainer.rounds=many"], "trainer.rounds"),
         (["trainer=bc", "trainer.rounds=3"], "trainer.rounds"),
         (["env.num_agents=[8,0]"], "env.num_agents=0 is out of range"),
-        (["env.num_agents=many"], "env.num_agents"),
-        (["env.num_agents=3.5"], "env.num_agents"),
+        (["env.num_agents=null"], "env.num_agents=None is not a whole number"),
+        (["env.num_agents=[4,4]"], "must name each size once"),
+        (["env.start_distance=9"], "do not fit into a ball"),
+        (["model.hops=0"], "has nothing to learn"),
+        (["trainer.round_updates=1", "env.num_agents=[4,5]"], "too few for 2 sizes"),
         (["trainer.learning_rates=[1e-3]"], "trainer.learning_rates"),
         (["device=tpu9"], "device=tpu9"),
     ],

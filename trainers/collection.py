@@ -10,9 +10,10 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRobinWriter
 
-from modgnn_rl.configs.schema import FlockingConfig, ImitationConfig, TrainConfig
+from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, ImitationConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.mixing import Mixture
 
 __all__ = ["Flocks", "as_windows", "flocks_of_all_sizes"]
@@ -21,8 +22,8 @@ __all__ = ["Flocks", "as_windows", "flocks_of_all_sizes"]
 class Flocks:
     """Flocks of one size, flown by a mixture of policy and expert through TorchRL's `Collector`, and their data.
 
-    Each call of `fly` continues the flights where they were, labels every visited state with the expert's action, and
-    adds windows of it to the replay buffer; when that is full, the oldest go.
+    Each call of `fly` continues the flights where they were; `keep` adds windows of them to the replay buffer, and when
+    that is full, the oldest go.
 
     Args:
         config: the world.
@@ -58,10 +59,12 @@ class Flocks:
         self.keys = {*policy.in_keys, ("agents", "controlled"), *expert.out_keys[:1]}
         if self.window > 1:
             self.keys -= {policy.messages_key}
-        self.mixture = Mixture(1.0, stretch, torch.Generator().manual_seed(seed))
-        env = FlockingEnv(num_envs, num_agents, config=config, seed=seed, device=device, stagger=True)
+        self.mixture = Mixture(1.0, stretch, torch.Generator().manual_seed(derive_seed(seed, "mixture")))
+        self.env = FlockingEnv(
+            num_envs, num_agents, config=config, seed=derive_seed(seed, "env"), device=device, stagger=True
+        )
         self.collector = Collector(
-            env,
+            self.env,
             TensorDictSequential(policy, expert, self.mixture),
             frames_per_batch=num_envs * steps,
             total_frames=-1,
@@ -69,6 +72,7 @@ class Flocks:
             trust_policy=True,
             no_cuda_sync=True,
         )
+        self.mixture.restart()  # the collector has tried the policy out
         self.flights: Iterator[TensorDictBase] = iter(self.collector)
         # Not compilable ones would share their counters between processes, and start one of their own for that.
         self.buffer = ReplayBuffer(
@@ -76,16 +80,28 @@ class Flocks:
             writer=RoundRobinWriter(compilable=True),
             sampler=RandomSampler(),
             batch_size=settings.batch_size,
-            generator=torch.Generator().manual_seed(seed + 1),
+            generator=torch.Generator(device).manual_seed(derive_seed(seed, "batches")),
         )
 
     def fly(self, expert_share: float) -> TensorDictBase:
-        """Continue the flights and keep what they saw; returns the flights themselves [B, T]."""
-        self.mixture.new_stretch(expert_share)
+        """Continue the flights by some steps, and label every state with the expert's action; flights [B, T]."""
+        self.mixture.share = expert_share
         with torch.no_grad():
-            flights = next(self.flights)
+            return next(self.flights)
+
+    def keep(self, flights: TensorDictBase) -> None:
+        """Add flights to the data."""
         self.buffer.extend(as_windows(flights.select(*self.keys), self.window, self.every))
-        return flights
+
+    @property
+    def generators(self) -> dict[str, torch.Generator]:
+        """All that draws at random here, by name."""
+        size = self.num_agents
+        return {
+            f"{size}.env": self.env.generator,
+            f"{size}.mixture": self.mixture.generator,
+            f"{size}.batches": self.buffer._rng,
+        }
 
     def close(self) -> None:
         """End the flights."""
@@ -97,7 +113,7 @@ def flocks_of_all_sizes(
 ) -> list[Flocks]:
     """The flocks of a training run, one group for each size in ``config.env.num_agents``, of as many agents each."""
     sizes = config.env.sizes
-    agents = 32 * config.trainer.num_envs / len(sizes)
+    agents = REFERENCE_SIZE * config.trainer.num_envs / len(sizes)
     return [
         Flocks(
             config.env,
@@ -108,10 +124,10 @@ def flocks_of_all_sizes(
             expert,
             steps=steps,
             stretch=stretch,
-            seed=1000 * config.seed + 10 * number,
+            seed=derive_seed(config.seed, "flocks", size),
             device=config.device,
         )
-        for number, size in enumerate(sizes)
+        for size in sizes
     ]
 
 

@@ -7,13 +7,12 @@ import math
 from modgnn_rl.configs.schema import DAggerConfig, TrainConfig
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.loggers import GuardedLogger
-from modgnn_rl.models import make_model
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.trainers.collection import flocks_of_all_sizes
 from modgnn_rl.trainers.journal import Journal, flight_metrics
-from modgnn_rl.trainers.learner import Learner
 from modgnn_rl.trainers.mixing import expert_share
+from modgnn_rl.trainers.setup import make_learner
 
 __all__ = ["dagger"]
 
@@ -34,20 +33,18 @@ def dagger(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN
         the trained policy.
     """
     settings: DAggerConfig = config.trainer
-    model = config.model
-    policy = make_model(model.name, model.hops, model.hidden, max_speed=config.env.max_speed, seed=config.seed)
     sizes = config.env.sizes
     cloning = settings.cloning_updates // len(sizes)
-    fitting = max(1, settings.round_updates // len(sizes))
+    fitting = settings.round_updates // len(sizes)
     updates = (cloning + settings.rounds * fitting) * len(sizes)
-    learner = Learner(policy.to(config.device), settings, (cloning * len(sizes), updates), config.seed)
+    learner = make_learner(config, (cloning * len(sizes), updates))
     expert = Reynolds.for_env(config.env)
     flocks = flocks_of_all_sizes(config, learner.flown, expert, steps=settings.round_steps, stretch=settings.stretch)
 
-    with Journal(run, logger, learner, updates, settings) as journal:
+    with Journal(run, logger, learner, flocks, updates, settings) as journal:
         for group in flocks:
             for _ in range(math.ceil(settings.cloning_steps / settings.round_steps)):
-                group.fly(expert_share=1.0)
+                group.keep(group.fly(expert_share=1.0))
             loss = learner.fit(group.buffer, cloning)
             journal.note(0, {f"{group.num_agents}/loss": loss}, cloning, cloned=loss)
 
@@ -62,11 +59,10 @@ def dagger(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN
             metrics = {"expert_share": share, "learning_rate": learner.learning_rate}
             for group in flocks:
                 flights = group.fly(share)
-                metrics |= flight_metrics(flights, str(group.num_agents))
+                group.keep(flights)
+                metrics |= flight_metrics(flights, config.env)
                 metrics[f"{group.num_agents}/loss"] = learner.fit(group.buffer, fitting)
             error = sum(metrics[f"{size}/error"] for size in sizes) / len(sizes)
             journal.note(index + 1, metrics, fitting * len(sizes), round=f"{index + 1}/{settings.rounds}", error=error)
 
-    for group in flocks:
-        group.close()
     return learner.flown

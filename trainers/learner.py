@@ -14,8 +14,9 @@ from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
 
-from modgnn_rl.configs.schema import ImitationConfig
+from modgnn_rl.configs.schema import REFERENCE_SIZE, ImitationConfig
 from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.imitation import imitation_loss, random_receivers, random_rotations, rotate
 
 __all__ = ["Learner", "cosine_learning_rate"]
@@ -35,8 +36,8 @@ class Learner:
         self.policy = policy
         self.settings = settings
         self.averaged = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.averaging))
-        self.generator = torch.Generator().manual_seed(seed)
-        self.optimizer = torch.optim.Adam(policy.parameters(), lr=1.0)
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, "learner"))
+        self.optimizer = torch.optim.Adam([{"params": list(policy.parameters())}], lr=1.0)
         self.scheduler = LambdaLR(
             self.optimizer, lambda step: cosine_learning_rate(step, settings.learning_rates, updates)
         )
@@ -80,26 +81,26 @@ class Learner:
         if settings.rotate:
             rotations = random_rotations(len(batch), batch["agents", "observation"], self.generator)
             vectors: list[NestedKey] = [("agents", "observation"), ("agents", "expert_action")]
-            # Messages are kept in the data only where they are made of observed vectors.
+            # Messages are kept in the data only where they are sums of observations.
             vectors += [policy.messages_key] if policy.messages_key in batch else []
             for key in vectors:
                 batch[key] = rotate(batch[key], rotations)
         controlled = batch["agents", "controlled"][:, -1]
         # At any size as many links as at 32 agents, so that an update takes as long.
-        count = max(1, round(settings.receivers * 32 / controlled.shape[-1]))
+        count = max(1, round(settings.receivers * REFERENCE_SIZE / controlled.shape[-1]))
         return imitation_loss(policy, batch, random_receivers(controlled, count, self.generator))
 
     def state(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
-        """What a checkpoint holds: named tensors (policy, trained weights, optimiser, generator), and plain values."""
+        """What a checkpoint holds of the learner: named tensors, and plain values."""
         moments = self.optimizer.state_dict()["state"]
         optimizer = {f"{index}.{name}": value for index, entry in moments.items() for name, value in entry.items()}
         tensors = {
             "policy": self.flown.state_dict(),
             "trained": self.policy.state_dict(),
             "optimizer": optimizer,
-            "generator": {"receivers_and_rotations": self.generator.get_state()},
         }
-        return tensors, {"updates": self.updates_done, "learning_rate": self.learning_rate}
+        averaged = int(self.averaged.n_averaged)
+        return tensors, {"updates": self.updates_done, "averaged": averaged, "learning_rate": self.learning_rate}
 
 
 def cosine_learning_rate(step: int, rates: Sequence[float], updates: tuple[int, int]) -> float:

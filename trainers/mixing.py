@@ -10,11 +10,13 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from modgnn_rl.errors import InputError
+
 __all__ = ["Mixture", "expert_share"]
 
 
 def expert_share(schedule: str, round_index: int, *, start: float, decay: float, last_round: int) -> float:
-    """The expert's share of the flying time in one round; 0 from ``last_round`` on.
+    """The expert's share of the flying time in one round; with each schedule 0 from ``last_round`` on.
 
     Args:
         schedule: ``constant`` (start), ``linear`` (start (1 - k / last_round)) or ``exponential`` (start decay^k).
@@ -25,6 +27,9 @@ def expert_share(schedule: str, round_index: int, *, start: float, decay: float,
 
     Returns:
         probability between 0 and 1 that the expert flies a flock for a stretch of time.
+
+    Raises:
+        InputError: for another schedule.
     """
     if round_index >= last_round:
         return 0.0
@@ -32,7 +37,9 @@ def expert_share(schedule: str, round_index: int, *, start: float, decay: float,
         return start
     if schedule == "linear":
         return start * (1 - round_index / last_round)
-    return start * decay**round_index
+    if schedule == "exponential":
+        return start * decay**round_index
+    raise InputError(f"schedule '{schedule}' is not one of constant, linear, exponential")
 
 
 class Mixture(TensorDictModuleBase):
@@ -42,7 +49,7 @@ class Mixture(TensorDictModuleBase):
     each stretch a coin is tossed for each flock; within the stretch the same one flies all its agents.
 
     Args:
-        share: probability that the expert flies a flock; set it anew at each round.
+        share: probability that the expert flies a flock; may be set anew at any time, for the tosses that follow.
         stretch: steps between two tosses.
         generator: source of randomness.
         action: key of the policy's action, overwritten [*B, N, 3].
@@ -69,9 +76,9 @@ class Mixture(TensorDictModuleBase):
         self._steps = 0
         self._expert_flies: Tensor | None = None
 
-    def new_stretch(self, share: float) -> None:
-        """Set the expert's share and toss again at the next step."""
-        self.share, self._expert_flies = share, None
+    def restart(self) -> None:
+        """Toss at the next step."""
+        self._expert_flies = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Choose the action of each flock."""

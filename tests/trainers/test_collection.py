@@ -37,7 +37,7 @@ def test_flights_go_on_where_they_were_and_carry_their_messages():
 
 def test_every_state_is_labelled_with_the_expert_of_that_state():
     flocks = _flocks(make_model("pair_force", seed=0))
-    flocks.fly(0.5)
+    flocks.keep(flocks.fly(0.5))
     batch = flocks.buffer.sample()
     position, velocity = batch["agents", "observation"].split(3, -1)
     expected = reynolds(position, velocity, cohesion=0.06, separation=0.8, alignment=0.02, max_speed=0.92)
@@ -65,6 +65,8 @@ def test_new_weights_fly_at_once():
 def test_one_seed_fixes_the_data():
     first, again, other = (_flocks(make_model("gcn", seed=0), seed=seed) for seed in (1, 1, 2))
     flights = [flocks.fly(0.5) for flocks in (first, again, other)]
+    for flocks, flown in zip((first, again), flights, strict=False):
+        flocks.keep(flown)
     assert (flights[0] == flights[1]).all()
     assert not (flights[0]["agents", "observation"] == flights[2]["agents", "observation"]).all(-1).any()
     assert (first.buffer.sample() == again.buffer.sample()).all()
@@ -73,7 +75,7 @@ def test_one_seed_fixes_the_data():
 def test_learned_messages_are_kept_as_windows_without_the_stale_ones():
     policy = ModGNN(ModGNNLayer(2, f_input=nn.Linear(6, 4), f_final=nn.Linear(4, 3)))
     flocks = _flocks(policy)
-    flocks.fly(0.0)
+    flocks.keep(flocks.fly(0.0))
     batch = flocks.buffer.sample()
     assert batch.batch_size == (16, 3)
     assert "messages" not in batch.keys()  # noqa: SIM118 - a TensorDict, not a dict

@@ -37,7 +37,7 @@ def test_learning_rate_passes_its_three_values_without_jumps():
 
 
 def test_fitting_lowers_the_loss_and_the_optimiser_goes_on(flights):
-    flights.fly(1.0)
+    flights.keep(flights.fly(1.0))
     learner = _learner()
     before = learner.validate(flights.buffer)
     learner.fit(flights.buffer, 60)
@@ -47,7 +47,7 @@ def test_fitting_lowers_the_loss_and_the_optimiser_goes_on(flights):
 
 
 def test_what_flies_is_the_moving_average_of_the_weights(flights):
-    flights.fly(1.0)
+    flights.keep(flights.fly(1.0))
     learner = _learner(averaging=0.9)
     expected = copy.deepcopy(learner.policy.state_dict())
     for update in range(5):
@@ -64,7 +64,7 @@ def test_one_seed_fixes_the_weights():
         settings = DAggerConfig(capacity=500, batch_size=64)
         learner = _learner()
         group = Flocks(FlockingConfig(), settings, 8, 6, learner.flown, Reynolds(), steps=40, stretch=40, seed=0)
-        group.fly(0.5)
+        group.keep(group.fly(0.5))
         learner.fit(group.buffer, 5)
         weights.append(torch.cat([parameter.flatten() for parameter in learner.flown.parameters()]))
     assert torch.equal(*weights)

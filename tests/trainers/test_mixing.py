@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from modgnn_rl.errors import InputError
 from modgnn_rl.trainers.mixing import Mixture, expert_share
 
 
@@ -51,8 +52,15 @@ def test_the_share_is_the_share_of_flocks(share):
     assert (mixed["agents", "action"][..., 0, 0].bool() == mixed["expert_flies"].squeeze(-1)).all()
 
 
-def test_a_new_stretch_tosses_again_with_the_new_share():
-    mixture = Mixture(1.0, 1000, torch.Generator().manual_seed(0))
-    assert _fly(mixture, 10)["expert_flies"].all()
-    mixture.new_stretch(0.0)
-    assert not _fly(mixture, 10)["expert_flies"].any()
+def test_a_new_share_holds_from_the_next_toss_on():
+    mixture = Mixture(1.0, 3, torch.Generator().manual_seed(0))
+    flown = []
+    for _ in range(6):
+        flown.append(bool(_fly(mixture, 10)["expert_flies"].all()))
+        mixture.share = 0.0
+    assert flown == [True] * 3 + [False] * 3
+
+
+def test_an_unknown_schedule_is_refused():
+    with pytest.raises(InputError, match="schedule 'linaer'"):
+        _share("linaer", 0)
