@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from modgnn_rl.envs.rewards import flocking_reward
 from modgnn_rl.envs.starts import uniform_ball
 from modgnn_rl.errors import InputError
 from modgnn_rl.metrics import is_diverged
-from modgnn_rl.settings import check
+from modgnn_rl.settings import check, suggestion
 from modgnn_rl.tensors import clip_to_ball, pair_distances
 
 __all__ = ["FlockingEnv", "make_physics"]
@@ -70,6 +71,10 @@ class FlockingEnv(EnvBase):
     ) -> None:
         if config is not None and settings:
             raise InputError(f"give either a config or settings, not both: {', '.join(settings)}")
+        known = [field.name for field in dataclasses.fields(FlockingConfig)]
+        for name in settings:
+            if name not in known:
+                raise InputError(f"FlockingEnv has no setting {name}{suggestion(name, known)}")
         self.config = config if config is not None else FlockingConfig(**settings)
         self.num_agents = self.config.num_agents if num_agents is None else num_agents
         check(self.config, "env")

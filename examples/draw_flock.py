@@ -1,6 +1,6 @@
 """Draw flocks that fly with a trained policy and with its expert from the same start, as a PNG.
 
-    python examples/draw_flock.py runs/<date>-<name> flock.png
+    python examples/draw_flock.py 'runs/<date>-<name>' flock.png
 
 Agents are dots, the leader is marked by a star, arrows are target velocities, thin lines are links of the
 communication graph. Needs matplotlib.
@@ -8,7 +8,7 @@ communication graph. Needs matplotlib.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import InitTracker, TransformedEnv
 
 from modgnn_rl import load_policy
+from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.experts import Reynolds
+from modgnn_rl.loading import stored_world
+from modgnn_rl.run_folder import RunFolder
 
 STEPS = (72, 240, 960)  # 1.5 s, 5 s, 20 s
 TRAIL = 96  # steps
@@ -30,13 +33,13 @@ ARROW = 0.9  # metres an arrow is long for 1 m/s
 SEED = 12
 
 
-def fly(policy: TensorDictModuleBase) -> dict[str, np.ndarray]:
+def fly(policy: TensorDictModuleBase, world: FlockingConfig) -> dict[str, np.ndarray]:
     """Positions [T, N, 3], target velocities [T, N, 3] and graphs [T, N, N] of one flight of 32 agents."""
-    env = TransformedEnv(FlockingEnv(1, 32, seed=SEED), InitTracker())
+    env = TransformedEnv(FlockingEnv(1, 32, config=world, seed=SEED), InitTracker())
     if hasattr(policy, "make_tensordict_primer"):
         env.append_transform(policy.make_tensordict_primer())
     with torch.no_grad():
-        flight = env.rollout(max(STEPS) + 1, policy)[0]
+        flight = env.rollout(max(STEPS) + 1, policy, break_when_any_done=False)[0]
     return {
         "position": flight["agents", "observation"][..., :3].numpy(),
         "action": flight["agents", "action"].numpy(),
@@ -69,10 +72,12 @@ def draw(axes: Any, flight: dict[str, np.ndarray], step: int) -> None:
 def main(run: Path, picture: Path) -> None:
     """Draw the policy's flight above the expert's."""
     mpl.use("Agg")
-    rows = {"ModGNN, hears 3.5 m far": load_policy(run), "expert, sees all": Reynolds(action=("agents", "action"))}
+    world = stored_world(RunFolder.open(run))
+    expert = Reynolds.for_env(world, action=("agents", "action"))
+    rows = {f"ModGNN, hears {world.comm_range:g} m far": load_policy(run), "expert, sees all": expert}
     figure, axes = plt.subplots(len(rows), len(STEPS), figsize=(12, 7.6), subplot_kw={"projection": "3d"})
     for line, (name, policy) in zip(axes, rows.items(), strict=True):
-        flight = fly(policy)
+        flight = fly(policy, world)
         for panel, step in zip(line, STEPS, strict=True):
             draw(panel, flight, step)
             panel.set_title(f"{name}, {step / 48:g} s", fontsize=13, y=1.0)
@@ -81,4 +86,7 @@ def main(run: Path, picture: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument("picture", type=Path, help="PNG file to write")
+    main(**vars(parser.parse_args()))

@@ -240,6 +240,8 @@ def _explain(error: BaseException, known: list[str]) -> str:
         return f"there is no configuration {error.missing_cfg_file}.yaml where configurations are looked for"
     if isinstance(error, OverrideParseException):
         return f"cannot read '{error.override}': {error.message.splitlines()[0]}; expected key=value"
+    if foreign := re.match(r"Could not override '([^']*)'\.\s+No match in the defaults list", str(error)):
+        return f"this command has no choice {foreign[1]}; --help lists what it has"
     cause = error if isinstance(error, OmegaConfBaseException) else error.__cause__ or error.__context__
     if not isinstance(cause, OmegaConfBaseException):
         return str(error) or type(error).__name__
@@ -263,8 +265,9 @@ def _help(main: Callable[..., Any], name: str, config: DictConfig) -> str:
     loader = GlobalHydra.instance().config_loader()
     chosen = config.hydra.runtime.choices
     lines = [f"python -m modgnn_rl.{name} [group=choice ...] [setting=value ...] [flags]", ""]
-    lines += [*(main.__doc__ or "").strip().splitlines()[:1], "", "Choices (in use: *)"]
-    for group in sorted(set(loader.list_groups("")) - {"hydra"}):
+    lines += [*(main.__doc__ or "").strip().splitlines()[:1], ""]
+    lines += ["Choices (in use: *)"] if set(chosen) - {"hydra"} else []
+    for group in sorted(set(loader.list_groups("")) & set(chosen)):
         options = loader.get_group_options(group, ObjectType.CONFIG)
         if options:
             lines.append(f"  {group}=" + ", ".join(f"{o}*" if chosen.get(group) == o else o for o in options))

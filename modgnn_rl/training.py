@@ -126,7 +126,7 @@ def prepare_torch(device: str, threads: int) -> None:
     if threads:
         torch.set_num_threads(threads)
     try:
-        torch.zeros(1, device=device)
+        torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise InputError(f"device={device} cannot be used ({reason}); device=cpu works everywhere") from error
