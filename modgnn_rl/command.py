@@ -266,12 +266,14 @@ def _help(main: Callable[..., Any], name: str, config: DictConfig) -> str:
     chosen = config.hydra.runtime.choices
     lines = [f"python -m modgnn_rl.{name} [group=choice ...] [setting=value ...] [flags]", ""]
     lines += [*(main.__doc__ or "").strip().splitlines()[:1], ""]
-    lines += ["Choices (in use: *)"] if set(chosen) - {"hydra"} else []
-    for group in sorted(set(loader.list_groups("")) & set(chosen)):
+    groups = sorted(set(loader.list_groups("")) & set(chosen))
+    lines += ["Choices (in use: *)"] if groups else []
+    for group in groups:
         options = loader.get_group_options(group, ObjectType.CONFIG)
         if options:
             lines.append(f"  {group}=" + ", ".join(f"{o}*" if chosen.get(group) == o else o for o in options))
-    lines += ["", "Settings, with the values they have under these choices", *_setting_lines(config)]
+    lines += [""] if groups else []
+    lines += ["Settings, with the values they have under these choices", *_setting_lines(config)]
     return "\n".join([*lines, "", "Flags", FLAGS])
 
 
