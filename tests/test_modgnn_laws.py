@@ -376,3 +376,20 @@ def test_copies_are_independent_and_equal() -> None:
     for other in (copied, pickled, loaded):
         assert torch.equal(actions(other, *data), expected)
     assert actions(copied.float(), data[0].float(), data[1]).dtype == torch.float32
+
+
+def test_an_f_com_with_keys_is_refused() -> None:
+    keyed = TensorDictModule(nn.Identity(), in_keys=["data"], out_keys=["data"])
+    with pytest.raises(InputError, match="cannot have keys"):
+        ModGNNLayer(1, f_com=keyed)
+
+
+def test_an_f_com_that_changes_the_width_between_hops_is_refused() -> None:
+    class Widen(nn.Module):
+        def forward(self, sender: Tensor, receiver: Tensor) -> Tensor:
+            return torch.cat((sender, receiver), -1)
+
+    observation, adjacency = torch.randn(1, 1, 3, 2), torch.ones(1, 1, 3, 3)
+    ModGNNLayer(1, f_com=Widen(), f_mid=[nn.Linear(2, 2), nn.Linear(4, 2)])(observation, adjacency)
+    with pytest.raises(InputError, match="turns 2 features into 4"):
+        ModGNNLayer(2, f_com=Widen(), f_mid=[nn.Linear(2, 2), nn.Linear(4, 2), nn.Linear(4, 2)])(observation, adjacency)

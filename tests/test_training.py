@@ -12,6 +12,7 @@ import yaml
 from tensordict import TensorDict
 
 from modgnn_rl import load_policy
+from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import (
     BCConfig,
     DAggerConfig,
@@ -24,6 +25,7 @@ from modgnn_rl.configs.schema import (
 )
 from modgnn_rl.errors import InputError
 from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.trainers.journal import Journal
 from modgnn_rl.training import evaluate_run, prepare_torch, train
 
 SMALL = {"num_envs": 2, "batch_size": 16, "capacity": 400}
@@ -62,6 +64,31 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
     rows = ["pair_force", "expert", "LocalReynolds(hops=2)", "LocalReynolds(hops=1)", "zero action"]
     assert list(table) == rows
     assert all(row in (run.path / "evaluation.md").read_text() for row in rows)
+
+
+def test_a_checkpoint_holds_what_a_run_is_made_of(run):
+    checkpoint = load_checkpoint(run.checkpoints)
+    assert set(checkpoint.tensors) == {"policy", "trained", "optimizer", "generators"}
+    assert set(checkpoint.tensors["generators"]) == {"learner", "5.env", "5.mixture", "5.batches"}
+    assert checkpoint.state["config"] == run.config
+    assert checkpoint.state["updates"] == checkpoint.state["averaged"] == checkpoint.step == 10
+
+
+def test_an_interrupted_run_leaves_its_policy(tmp_path, monkeypatch, capsys):
+    noted = []
+
+    def interrupt(journal, step, *arguments, **figures):
+        noted.append(step)
+        if step == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Journal, "note", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        train(_config(tmp_path, _dagger()))
+    (folder,) = tmp_path.iterdir()
+    assert f"the policy so far is in {folder}" in capsys.readouterr().err
+    assert load_checkpoint(folder / "checkpoints").step == 8
+    load_policy(folder)
 
 
 @pytest.mark.parametrize("agents", [1, 2, 9])

@@ -484,3 +484,8 @@ def test_presets() -> None:
 @pytest.mark.parametrize(("given", "sizes"), [(8, [8]), ([8, 16], [8, 16])])
 def test_sizes_are_a_list(given: Any, sizes: list[int]) -> None:
     assert FlockingConfig(num_agents=given).sizes == sizes
+
+
+def test_an_unknown_setting_is_refused_with_a_suggestion() -> None:
+    with pytest.raises(InputError, match="no setting comm_rnge; did you mean 'comm_range'"):
+        FlockingEnv(1, 2, comm_rnge=3.0)
