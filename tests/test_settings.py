@@ -41,7 +41,7 @@ def test_the_defaults_pass():
     [
         ({"inner": Inner(0.0)}, r"run.inner.speed=0.0 is out of range: it must be greater than 0 \(speed, m/s\)"),
         ({"inner": Inner(float("nan"))}, "run.inner.speed is not a number"),
-        ({"inner": Inner("fast")}, "run.inner.speed=fast is not a number"),
+        ({"inner": Inner("fast")}, "run.inner.speed=fast is not a number"),  # type: ignore[arg-type]
         ({"count": 0}, "must be at least 1"),
         ({"count": [3, 10]}, "run.count=10 is out of range: it must be at most 9"),
         ({"count": 2.5}, "is not a whole number or a list of them"),
