@@ -101,10 +101,10 @@ class ImitationConfig:
 
     name: str = setting(MISSING, "trainer", choices=("bc", "dagger"))
     num_envs: int = setting(
-        64, "flocks of 32 agents flown at once; other sizes get as many agents, shared between the sizes", low=1
+        32, "flocks of 32 agents flown at once; other sizes get as many agents, shared between the sizes", low=1
     )
     every: int = setting(2, "of the steps flown, each how-manyth becomes data", low=1)
-    capacity: int = setting(16_000, "flock states kept for each size; the oldest go first", low=1)
+    capacity: int = setting(80_000, "flock states kept for each size; the oldest go first", low=1)
     batch_size: int = setting(256, "flock states in a batch", low=1)
     receivers: int = setting(
         4,
@@ -117,7 +117,7 @@ class ImitationConfig:
         above=0,
         length=3,
     )
-    averaging: float = setting(0.99, "decay of the moving average of the weights, which is what flies", low=0, high=1)
+    averaging: float = setting(0.995, "decay of the moving average of the weights, which is what flies", low=0, high=1)
     max_gradient: float = setting(1.0, "gradients are clipped to this norm", above=0)
     rotate: bool = setting(True, "turn each state of a batch by a random rotation")
     checkpoint_minutes: float = setting(1.0, "time between two checkpoints, min", low=0)
@@ -128,7 +128,6 @@ class BCConfig(ImitationConfig):
     """Behaviour cloning: fit the expert on the expert's own flights."""
 
     name: str = setting("bc", "trainer", choices=("bc",))
-    capacity: int = setting(32_000, "flock states kept for each size; the oldest go first", low=1)
     cloning_steps: int = setting(1000, "steps that the expert flies", low=1)
     cloning_updates: int = setting(6000, "updates on its flights, shared by the sizes", low=1)
     held_out: int = setting(8, "flocks whose flights are kept for the validation error", low=1)
@@ -143,7 +142,7 @@ class DAggerConfig(ImitationConfig):
     cloning_updates: int = setting(400, "updates on its flights, shared by the sizes", low=0)
     rounds: int = setting(120, "rounds of flying and fitting", low=0)
     round_steps: int = setting(40, "steps flown in a round", low=1)
-    round_updates: int = setting(40, "updates in a round, shared by the sizes", low=1)
+    round_updates: int = setting(60, "updates in a round, shared by the sizes", low=1)
     schedule: str = setting(
         "exponential",
         "how the expert's share falls until it flies no more",
