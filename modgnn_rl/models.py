@@ -44,6 +44,7 @@ class Scale(nn.Module):
         hide_position: return zero positions, for data that are no differences.
     """
 
+    is_linear_map = True
     factor: Tensor
 
     def __init__(self, *, hide_position: bool = False) -> None:

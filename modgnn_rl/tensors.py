@@ -6,8 +6,37 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-__all__ = ["clip_to_ball", "pair_differences", "pair_distances", "squared_norm"]
+__all__ = [
+    "clip_to_ball",
+    "is_transformed",
+    "keep_rows",
+    "pair_differences",
+    "pair_distances",
+    "squared_norm",
+    "stack_padded",
+]
+
+
+def is_transformed() -> bool:
+    """Whether a compiler or a transform of ``torch.func`` is at work, under which shapes must not depend on data."""
+    return torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None
+
+
+def keep_rows(value: Tensor, rows: Tensor, other: float = 0.0) -> Tensor:
+    """Value [R, ...] in the rows to keep, bool [R], and ``other`` elsewhere; what is NaN there reaches no gradient."""
+    # Choosing costs far more than looking whether there is anything to choose, where looking does not stall a device.
+    if value.device.type == "cpu" and not is_transformed() and rows.all():
+        return value
+    filling = torch.full((), other, dtype=value.dtype, device=value.device)
+    return torch.where(rows.view(-1, *[1] * (value.ndim - 1)), value, filling)
+
+
+def stack_padded(tensors: Sequence[Tensor]) -> Tensor:
+    """Stack tensors [..., D_k] of any widths along the last dimension but one, filled up with zeros [..., K, D]."""
+    width = max(tensor.shape[-1] for tensor in tensors)
+    return torch.stack([pad(tensor, (0, width - tensor.shape[-1])) for tensor in tensors], -2)
 
 
 def clip_to_ball(vector: Tensor, radius: float) -> Tensor:

@@ -153,7 +153,7 @@ def test_gcn_is_linear_inside_the_ball() -> None:
 def test_pair_force_reads_the_receivers_own_velocity() -> None:
     policy = make_model("pair_force", hops=1, seed=0, observation=("flock", "state"), action="u")
     assert ("flock", "state") in policy.in_keys
-    assert len(policy.in_keys) == 4
+    assert len(policy.in_keys) == 5
     force = PairForce().double()
     relative, own = torch.randn(2, 7, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     moved = own + torch.tensor([1.0, 2, 3, 0, 0, 0])

@@ -136,7 +136,8 @@ def by_the_formula(layer: ModGNNLayer, seen: Tensor, data: TensorDict) -> tuple[
         """y_ij^(k)(t) of all neighbours."""
         neighbours = graph[max(t, begin), i].nonzero().view(-1).tolist()
         mine = aggregate(k - 1, i, t - 1, begin)
-        return [layer.f_com(aggregate(k - 1, j, t - 1, begin), mine) for j in neighbours]
+        f_com = layer.f_com[k - 1]
+        return [f_com(aggregate(k - 1, j, t - 1, begin), mine) for j in neighbours]
 
     def processed(k: int, y: Tensor | None, t: int, i: int) -> Tensor:
         return call(layer.f_pre[k], y, own(t, i))

@@ -91,7 +91,7 @@ class Flocks:
 
     def keep(self, flights: TensorDictBase) -> None:
         """Add flights to the data."""
-        self.buffer.extend(as_windows(flights.select(*self.keys), self.window, self.every))
+        self.buffer.extend(as_windows(flights.select(*self.keys, strict=False), self.window, self.every))
 
     @property
     def generators(self) -> dict[str, torch.Generator]:
