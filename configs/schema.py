@@ -19,6 +19,7 @@ __all__ = [
     "DAggerConfig",
     "EvaluateConfig",
     "EvaluationConfig",
+    "ExportConfig",
     "FlockingConfig",
     "ImitationConfig",
     "LoggerConfig",
@@ -28,6 +29,7 @@ __all__ = [
 ]
 
 
+MODEL_NAMES = ("pair_force", "modgnn_mlp", "no_pre", "no_mid", "gcn", "gcn_final", "central", "gat", "mpnn")
 REFERENCE_SIZE = 32  # the flock size to which start_radius, num_envs and receivers refer
 
 
@@ -90,8 +92,9 @@ class FlockingConfig:
 class ModelConfig:
     """The policy: one of the models of `modgnn_rl.models`."""
 
-    name: str = setting("pair_force", "model", choices=("pair_force", "modgnn_mlp", "gcn"))
-    hops: int = setting(1, "communication hops K", low=0)
+    name: str = setting("pair_force", "model", choices=MODEL_NAMES)
+    hops: int = setting(1, "communication hops K of each layer", low=0)
+    layers: int = setting(1, "layers; with several, agents hear of others over layers x hops links", low=1)
     hidden: int = setting(32, "width of the hidden layers", low=1)
 
 
@@ -202,3 +205,12 @@ class EvaluateConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
     threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
+
+
+@dataclass
+class ExportConfig:
+    """Export of a finished run's policy for robots."""
+
+    run: str = setting(MISSING, "run folder")
+    output: str | None = setting(None, "folder for the exported agent, made anew; null: agent/ in the run folder")
+    threads: int = setting(1, "threads of torch where its latency is measured; 0: one a core", low=0)

@@ -19,13 +19,15 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+from torch.func import functional_call
 from torch.nn.modules.batchnorm import _NormBase
 
 from modgnn_rl import relu_links
 from modgnn_rl.communication import Communication
-from modgnn_rl.graph import Graph, Links, Pairs
+from modgnn_rl.graph import Graph, Links
+from modgnn_rl.tensors import is_transformed
 
-__all__ = ["Hop", "aggregate", "call"]
+__all__ = ["Hop", "aggregate", "call", "suited_form"]
 
 STORED_LINKS = 1 << 16  # up to this many links, the backward pass finds all activations stored
 
@@ -61,7 +63,7 @@ def _call_keyed(module: TensorDictModuleBase, entries: Tables, links: Graph | No
         rows["link", "weight"] = links.weight.unsqueeze(-1)
     if links is not None and links.feature is not None:
         rows["link", "feature"] = links.feature
-    return module(rows)[module.out_keys[0]]
+    return module(rows)[module.out_keys[-1]]
 
 
 def communicate(f_com: nn.Module, sender: Tensor, receiver: Tensor, own: Tables, links: Graph) -> Tensor:
@@ -94,37 +96,64 @@ def aggregate(
     Returns:
         one row a receiver [R, F]; zero where it receives on no link.
     """
-
-    def values(links: Graph, sender: Tensor, receiver: Tensor, own: Tables) -> Tensor:
-        y = communicate(f_com, sender, receiver, own, links)
-        if isinstance(links, Pairs):
-            y = links.only_linked(y)
-        result = call(f_pre, y, own, links)
-        if record is not None:
-            record("f_com", y)
-            record("f_pre", result)
-        return result
-
     if record is not None or not isinstance(graph, Links) or _has_batch_statistics(f_com, f_pre):
         own = {key: graph.at_receivers(value) for key, value in hop.own.items()}
         rows = graph.at_senders(hop.senders), graph.at_receivers(hop.receivers)
-        return graph.aggregate(values(graph, *rows, own), aggregation)
+        return graph.aggregate(_values(f_com, f_pre, graph, *rows, own, record), aggregation)
     rewritten = relu_links.rewrite(graph, f_com, f_pre) if aggregation in ("sum", "mean") else None
     if rewritten is not None:
         total = rewritten(hop.senders, hop.receivers)
         return total / graph.degree().clamp(min=1).unsqueeze(-1) if aggregation == "mean" else total
-    parameters = [tensor for module in (f_com, f_pre) for tensor in _learned(module)]
     tables = (hop.senders, hop.receivers, *hop.own.values())
+    values = _OfLinks(f_com, f_pre)
     if torch.is_grad_enabled() and len(graph) > STORED_LINKS and not _learned_links(graph):
-        return _Recomputed.apply(values, graph, aggregation, tuple(hop.own), *tables, *parameters)
+        return _Recomputed.apply(values, graph, aggregation, tuple(hop.own), *tables, *values.weights().values())
     return _in_blocks(values, graph, aggregation, tuple(hop.own), tables)
 
 
-Values = Callable[[Graph, Tensor, Tensor, Tables], Tensor]
+def _values(
+    f_com: nn.Module,
+    f_pre: nn.Module,
+    links: Graph,
+    sender: Tensor,
+    receiver: Tensor,
+    own: Tables,
+    record: Callable[[str, Tensor], None] | None = None,
+) -> Tensor:
+    """``f_pre(f_com(m_j, m_i))`` of links [E, F]."""
+    y = communicate(f_com, sender, receiver, own, links)
+    if record is not None:
+        record("f_com", y)
+    result = call(f_pre, y, own, links)
+    if record is not None:
+        record("f_pre", result)
+    return result
+
+
+class _OfLinks(nn.Module):
+    """`_values` with its two modules, as one module."""
+
+    def __init__(self, f_com: nn.Module, f_pre: nn.Module) -> None:
+        super().__init__()
+        self.f_com, self.f_pre = f_com, f_pre
+
+    def forward(self, links: Graph, sender: Tensor, receiver: Tensor, own: Tables) -> Tensor:
+        return _values(self.f_com, self.f_pre, links, sender, receiver, own)
+
+    def weights(self) -> dict[str, Tensor]:
+        """Parameters and buffers by the place where they are; buffers as they are now: modules change them as they run.
+
+        A module in several places comes once. Parameters that several modules share come with each.
+        """
+        found: dict[str, Tensor] = {}
+        for path, module in self.named_modules():
+            found |= {f"{path}.{name}": value for name, value in module.named_parameters(recurse=False)}
+            found |= {f"{path}.{name}": value.clone() for name, value in module.named_buffers(recurse=False)}
+        return found
 
 
 def _in_blocks(
-    values: Values, graph: Links, aggregation: str, keys: tuple[tuple[str, ...], ...], tables: Iterable[Tensor]
+    values: _OfLinks, graph: Links, aggregation: str, keys: tuple[tuple[str, ...], ...], tables: Iterable[Tensor]
 ) -> Tensor:
     """Aggregate block by block; whole neighbourhoods lie in one block."""
     senders, *of_receivers = tables
@@ -138,18 +167,23 @@ def _in_blocks(
 
 
 class _Recomputed(torch.autograd.Function):
-    """`_in_blocks` that stores the nodes' tables only, and computes each block again in the backward pass."""
+    """`_in_blocks` that stores the nodes' tables only, and computes each block again in the backward pass.
+
+    The weights are those of the forward pass, which may have been lent to the modules for it (``functional_call``, the
+    losses of TorchRL) and taken back since.
+    """
 
     @staticmethod
     def forward(
         ctx: Any,
-        values: Values,
+        values: _OfLinks,
         graph: Links,
         aggregation: str,
         keys: tuple[tuple[str, ...], ...],
         *tensors: Tensor,
     ) -> Tensor:
         ctx.values, ctx.graph, ctx.aggregation, ctx.keys = values, graph, aggregation, keys
+        ctx.names = tuple(values.weights())
         device = tensors[0].device
         ctx.autocast = (device.type, torch.get_autocast_dtype(device.type), torch.is_autocast_enabled(device.type))
         ctx.generators = _generator_states(device)
@@ -160,11 +194,14 @@ class _Recomputed(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> Any:
         count = 2 + len(ctx.keys)
-        senders, *of_receivers = ctx.saved_tensors[:count]
-        parameters = ctx.saved_tensors[count:]
-        wanted = ctx.needs_input_grad[4:]
+        tensors, wanted = ctx.saved_tensors, ctx.needs_input_grad[4:]
+        senders, *of_receivers = tensors[:count]
+        weights = [
+            tensor.detach().clone().requires_grad_(needed)
+            for tensor, needed in zip(tensors[count:], wanted[count:], strict=True)
+        ]
         gradients = [
-            torch.zeros_like(t) if needed else None for t, needed in zip(ctx.saved_tensors, wanted, strict=True)
+            torch.zeros_like(tensor) if needed else None for tensor, needed in zip(tensors, wanted, strict=True)
         ]
         kind, dtype, enabled = ctx.autocast
         with _GeneratorsAt(ctx.generators, senders.device), torch.autocast(kind, dtype, enabled):
@@ -172,10 +209,15 @@ class _Recomputed(torch.autograd.Function):
                 block = ctx.graph.block(receivers, links)
                 rows = [block.at_senders(senders), *(block.at_receivers(table[receivers]) for table in of_receivers)]
                 rows = [row.requires_grad_(needed) for row, needed in zip(rows, wanted, strict=False)]
-                leaves = [tensor for tensor, needed in zip((*rows, *parameters), wanted, strict=True) if needed]
+                leaves = [tensor for tensor, needed in zip((*rows, *weights), wanted, strict=True) if needed]
                 with torch.enable_grad():
-                    result = ctx.values(block, *rows[:2], dict(zip(ctx.keys, rows[2:], strict=True)))
+                    sender, receiver, *own = (row.clone() for row in rows)  # which modules may change in place
+                    inputs = block, sender, receiver, dict(zip(ctx.keys, own, strict=True))
+                    given = dict(zip(ctx.names, weights, strict=True))
+                    result = functional_call(ctx.values, given, inputs, tie_weights=False)
                     result = block.aggregate(result, ctx.aggregation)
+                if not result.requires_grad:
+                    continue
                 found = iter(
                     torch.autograd.grad(result, leaves, gradient[receivers].to(result.dtype), allow_unused=True)
                 )
@@ -219,13 +261,15 @@ def _set_generators(states: list[Tensor], device: torch.device) -> None:
         torch.get_device_module(device).set_rng_state(states[1], device)
 
 
-def _learned(module: nn.Module) -> list[Tensor]:
-    return [tensor for tensor in (*module.parameters(), *module.buffers()) if tensor.requires_grad]
-
-
 def _learned_links(graph: Links) -> bool:
     return any(value is not None and value.requires_grad for value in (graph.weight, graph.feature))
 
 
 def _has_batch_statistics(*modules: nn.Module) -> bool:
+    """Whether modules, or parts of them, normalise by statistics of the rows that they are given."""
     return any(isinstance(part, _NormBase) for module in modules for part in module.modules())
+
+
+def suited_form(form: str, module: nn.Module) -> str:
+    """The form of graph to work on: where it is not set, links if batch statistics must see nothing else."""
+    return "links" if form == "auto" and _has_batch_statistics(module) and not is_transformed() else form

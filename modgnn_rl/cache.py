@@ -11,10 +11,13 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules import set_recurrent_mode
+
+from modgnn_rl.errors import InputError
 
 __all__ = ["AgentCache", "missing"]
 
@@ -33,11 +36,15 @@ class AgentCache(TensorDictPrimer):
     Args:
         module: the module that owns the state; run once on the zero observation to learn the shapes.
         keys: the root keys of its state, which it writes under ``"next"``.
+        is_init: the key under which the module looks whether an episode begins.
+
+    Raises:
+        InputError: when it is appended, if the module needs data that the environment does not have.
     """
 
-    def __init__(self, module: TensorDictModuleBase, keys: Sequence[str]) -> None:
+    def __init__(self, module: TensorDictModuleBase, keys: Sequence[str], *, is_init: NestedKey = "is_init") -> None:
         super().__init__(primers=Composite({key: Unbounded(()) for key in keys}), expand_specs=False)
-        self._keys = tuple(keys)
+        self._keys, self._is_init = tuple(keys), is_init
         # A bound method, since the module must not become a part of the environment; None once the shapes are known.
         self._run_once: Callable[[TensorDictBase], TensorDictBase] | None = module.forward
 
@@ -55,9 +62,15 @@ class AgentCache(TensorDictPrimer):
             return
         spec = self.parent.observation_spec
         seen = spec.zero()
-        seen["is_init"] = torch.ones(*spec.shape, 1, dtype=torch.bool, device=spec.device)
-        with torch.no_grad(), set_recurrent_mode(False):
-            state = self._run_once(seen)["next"]
+        seen[self._is_init] = torch.ones(*spec.shape, 1, dtype=torch.bool, device=spec.device)
+        try:
+            with torch.no_grad(), set_recurrent_mode(False):
+                state = self._run_once(seen)["next"]
+        except InputError as error:
+            raise InputError(
+                f"the policy cannot run on what the environment emits ({error}); what is made of observations must be "
+                "made by a transform that is appended before the policy's memory"
+            ) from error
         like = {key: state[key] for key in self._keys}
         specs = {key: Unbounded(value.shape, device=value.device, dtype=value.dtype) for key, value in like.items()}
         self.primers = Composite(specs, shape=spec.shape, device=spec.device)

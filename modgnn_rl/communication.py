@@ -6,7 +6,7 @@ sender and receiver held one step earlier. It may be
 - any module ``f_com(sender, receiver) -> y`` of two tensors [E, D], one row a link;
 - a `Communication`, which also sees the links: their weights and features, and the whole neighbourhood;
 - a TensorDictModule that reads ``"sender"``, ``"receiver"``, the receiver's own data now under ``"own"``, and the
-  links' ``("link", "weight")`` [E, 1] and ``("link", "feature")`` [E, F]; its first out-key is y.
+  links' ``("link", "weight")`` [E, 1] and ``("link", "feature")`` [E, F]; its last out-key is y.
 """
 
 from __future__ import annotations
@@ -148,11 +148,12 @@ class MessagePassing(Communication):
 class CoordinateFrame(Communication):
     """The sender's data in the receiver's frame of coordinates: moved to its place, turned by its heading.
 
-    Positions become relative to the receiver's; positions and vectors are then turned about the last axis (z, or the
+    Points become relative to the receiver's position; points and vectors are then turned about the last axis (z, or the
     plane's) by minus the heading of the receiver. All other columns stay as they are.
 
     Args:
-        positions: first columns of the points in the message, each with ``dimensions`` columns.
+        positions: first columns of the points in the message, each with ``dimensions`` columns: the agent's position,
+            and others (a goal, a landmark), if any.
         vectors: first columns of the vectors (velocities, directions), likewise.
         heading: column that holds the heading, rad; default: frames are not turned. The sender's heading becomes the
             difference of the headings, between -pi and pi.
@@ -177,8 +178,8 @@ class CoordinateFrame(Communication):
         """Return the senders' data in the receivers' frames [E, D]."""
         columns = list(sender.unbind(-1))
         for first in self.positions:
-            for column in range(first, first + self.dimensions):
-                columns[column] = columns[column] - receiver[..., column]
+            for axis in range(self.dimensions):
+                columns[first + axis] = columns[first + axis] - receiver[..., self.positions[0] + axis]
         if self.heading is not None:
             cosine, sine = receiver[..., self.heading].cos(), receiver[..., self.heading].sin()
             for first in (*self.positions, *self.vectors):

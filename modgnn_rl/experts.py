@@ -175,4 +175,4 @@ class LocalReynolds(Reynolds):
 
     def make_tensordict_primer(self) -> AgentCache:
         """The transform that gives an environment this module's recurrent state."""
-        return AgentCache(self, [self.cache])
+        return AgentCache(self, [self.cache], is_init=self.in_keys[2])

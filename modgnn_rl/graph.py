@@ -22,7 +22,7 @@ AGGREGATIONS = ("sum", "mean", "max")
 FORMS = ("auto", "links", "pairs")
 BLOCK = {"cpu": 8192}  # links worked on at once: their activations stay in the processor's cache
 BLOCK_ELSEWHERE = 1 << 20
-FEW_PAIRS = 4096  # up to here computing all pairs costs no more than listing the links
+FEW_PAIRS = 2048  # up to here computing all pairs costs no more than listing the links
 
 
 class Graph(abc.ABC):
@@ -74,7 +74,8 @@ class Graph(abc.ABC):
     def softmax(self, logits: Tensor) -> Tensor:
         """Softmax over each receiver's links: [E, H] -> [E, H]."""
         shifted = (logits - self.at_receivers(self.largest(logits.detach()))).exp()
-        return shifted / self.at_receivers(self.total(shifted)).clamp(min=torch.finfo(shifted.dtype).tiny)
+        # The largest contributes 1, so that less stands only where there is no link.
+        return shifted / self.at_receivers(self.total(shifted)).clamp(min=1)
 
 
 class Links(Graph):
@@ -104,7 +105,6 @@ class Links(Graph):
         self.num_senders, self.num_receivers = num_senders, num_receivers
         self.weight, self.feature, self.position = weight, feature, position
         self._degree: Tensor | None = None
-        self._blocks: list[Links] | None = None
 
     def __len__(self) -> int:
         return len(self.sender)
@@ -187,6 +187,10 @@ class Links(Graph):
 class Pairs(Graph):
     """All pairs, and a mask that tells which are linked.
 
+    Where gradients are wanted, a pair without a link gets the data of some link, or ones (the sender's) and zeros if
+    there is none: what a module makes of it counts for nothing, but must not be NaN, which would reach the gradients as
+    ``0 * NaN``.
+
     Args:
         mask: entry g, i, j says that receiver i of graph g receives from its sender j, bool [G, R, S].
         weight: weights [G, R, S].
@@ -197,20 +201,21 @@ class Pairs(Graph):
         self.mask = mask
         graphs, receivers, senders = mask.shape
         self.num_senders, self.num_receivers = graphs * senders, graphs * receivers
-        self.weight = None if weight is None else weight.reshape(-1)
-        self.feature = None if feature is None else feature.reshape(-1, feature.shape[-1])
+        self._some_link: Tensor | None = None
+        self.weight = None if weight is None else self._or_of_a_link(weight.reshape(-1))
+        self.feature = None if feature is None else self._or_of_a_link(feature.reshape(-1, feature.shape[-1]))
 
     def at_senders(self, table: Tensor) -> Tensor:
         """See `Graph.at_senders`."""
         graphs, receivers, senders = self.mask.shape
         spread = table.unflatten(0, (graphs, 1, senders)).expand(-1, receivers, -1, *table.shape[1:])
-        return spread.flatten(0, 2)
+        return self._or_of_a_link(spread.flatten(0, 2), without_any=1)
 
     def at_receivers(self, table: Tensor) -> Tensor:
         """See `Graph.at_receivers`."""
         graphs, receivers, senders = self.mask.shape
         spread = table.unflatten(0, (graphs, receivers, 1)).expand(-1, -1, senders, *table.shape[1:])
-        return spread.flatten(0, 2)
+        return self._or_of_a_link(spread.flatten(0, 2))
 
     def degree(self) -> Tensor:
         """See `Graph.degree`."""
@@ -220,6 +225,17 @@ class Pairs(Graph):
         """Values [E, ...] with ``other`` where there is no link."""
         linked = self.mask.reshape(-1, *[1] * (values.ndim - 1))
         return torch.where(linked, values, other)
+
+    def _or_of_a_link(self, values: Tensor, without_any: int = 0) -> Tensor:
+        """Values [E, ...] with those of some link where there is no link; ``without_any`` if there is none at all."""
+        if not torch.is_grad_enabled():
+            return values
+        if self._some_link is None:
+            linked = torch.cat((self.mask.flatten(), self.mask.new_ones(1)))
+            self._some_link = linked.int().argmax().view(1)
+        stand_in = values.new_full((1, *values.shape[1:]), without_any)
+        some = torch.cat((values, stand_in)).index_select(0, self._some_link)
+        return torch.where(self.mask.reshape(-1, *[1] * (values.ndim - 1)), values, some)
 
     def total(self, values: Tensor) -> Tensor:
         """See `Graph.total`."""
@@ -232,16 +248,18 @@ class Pairs(Graph):
         largest = self._by_receiver(self.only_linked(values, -torch.inf)).amax(1)
         return torch.where(self.degree().view(-1, *[1] * (values.ndim - 1)) > 0, largest, 0.0)
 
+    def softmax(self, logits: Tensor) -> Tensor:
+        """See `Graph.softmax`."""
+        return super().softmax(self._or_of_a_link(logits))
+
     def _by_receiver(self, values: Tensor) -> Tensor:
         return values.unflatten(0, (self.num_receivers, self.mask.shape[-1]))
 
     def between(self, senders: Tensor, receivers: Tensor) -> Pairs:
         """See `Graph.between`."""
-        graphs = self.mask.shape[0]
-        mask = self.mask & senders.view(graphs, 1, -1) & receivers.view(graphs, -1, 1)
-        pairs = Pairs(mask)
-        pairs.weight, pairs.feature = self.weight, self.feature
-        return pairs
+        graphs, of_receivers, of_senders = self.mask.shape
+        mask = self.mask & senders.view(graphs, 1, of_senders) & receivers.view(graphs, of_receivers, 1)
+        return Pairs(mask, self.weight, self.feature)
 
 
 class Topology:
@@ -282,7 +300,9 @@ class Topology:
         self.num_agents = num_agents
         self.is_edge_list = adjacency.dtype == torch.int64
         _check_shape(adjacency, num_agents, is_edge_list=self.is_edge_list)
-        self.adjacency = adjacency.reshape(-1, *adjacency.shape[-2:])
+        self.adjacency = adjacency.reshape(adjacency.shape[:-2].numel(), *adjacency.shape[-2:])
+        if self.is_edge_list and not is_transformed():
+            _check_numbers(adjacency, num_agents)
         if weight is None and adjacency.is_floating_point():
             weight = adjacency
         self.weight = None if weight is None else weight.reshape(-1)
@@ -291,13 +311,10 @@ class Topology:
             _check_count(name, value, self.adjacency[:, 0].numel() if self.is_edge_list else self.adjacency.numel())
         self.keep_positions = keep_positions
         self.exists = None if mask is None else mask.reshape(-1)
-        wanted = receivers if mask is None else mask if receivers is None else receivers & mask
-        self.wanted_nodes = None if wanted is None else wanted.reshape(-1)
-        self.as_pairs = form == "pairs" or (form == "auto" and self._suits_pairs())
-        # Numbers of the wanted nodes, as long as shapes may depend on data.
-        self.rows = None if self.as_pairs or self.wanted_nodes is None else self.wanted_nodes.nonzero().squeeze(-1)
+        self.as_pairs = form == "pairs" or (form == "auto" and self._suits_pairs(some=receivers is not None))
         self._everyone: Graph | None = None
         self._wanted: Graph | None = None
+        self._want(receivers)
 
     @property
     def num_nodes(self) -> int:
@@ -313,29 +330,43 @@ class Topology:
     def wanted(self) -> Graph:
         """The graph of the links to the wanted receivers; as links, its receivers are `rows`."""
         if self._wanted is None:
-            self._wanted = self.everyone() if self.rows is None else self._make_links(self.rows, compact=True)
+            if self.wanted_nodes is None:
+                self._wanted = self.everyone()
+            elif self.rows is None:
+                self._wanted = self.everyone().between(torch.ones_like(self.wanted_nodes), self.wanted_nodes)
+            else:
+                self._wanted = self._make_links(self.rows, compact=True)
         return self._wanted
 
-    def of_everyone(self) -> Topology:
-        """The same with the outputs of all agents that exist wanted."""
-        if self.wanted_nodes is self.exists:
+    def towards(self, receivers: Tensor | None) -> Topology:
+        """The same graphs with other outputs wanted, bool [*B, N]; None: those of all agents that exist."""
+        if receivers is None and self.wanted_nodes is self.exists:
             return self
         other = copy.copy(self)
-        other.wanted_nodes, other._wanted = self.exists, None
-        other.rows = None if self.as_pairs else self.exists_rows()
+        other._want(receivers)
         return other
+
+    def _want(self, receivers: Tensor | None) -> None:
+        wanted = None if receivers is None else receivers.reshape(-1)
+        if wanted is None or self.exists is None:
+            self.wanted_nodes = self.exists if wanted is None else wanted
+        else:
+            self.wanted_nodes = wanted & self.exists
+        # Numbers of the wanted nodes, as long as shapes may depend on data.
+        self.rows = None if self.as_pairs or self.wanted_nodes is None else self.wanted_nodes.nonzero().squeeze(-1)
+        self._wanted = None
 
     def exists_rows(self) -> Tensor | None:
         """Numbers of the nodes that exist; None: all."""
         return None if self.exists is None else self.exists.nonzero().squeeze(-1)
 
-    def _suits_pairs(self) -> bool:
+    def _suits_pairs(self, *, some: bool) -> bool:
         if is_transformed():
             return True
         return (
             not self.is_edge_list
             and self.exists is None
-            and self.wanted_nodes is None
+            and not some
             and self.adjacency.numel() <= FEW_PAIRS
             and 2 * int(self.adjacency.count_nonzero()) >= self.adjacency.numel()
         )
@@ -376,7 +407,6 @@ class Topology:
 
     def _listed_links(self, rows: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Senders, receivers and positions of an edge list's links to some nodes, ordered by receiver."""
-        _check_numbers(self.adjacency, self.num_agents)
         sender, receiver, valid = self._listed_nodes()
         if rows is not None:
             chosen = torch.zeros(self.num_nodes, dtype=torch.bool, device=rows.device)
@@ -400,9 +430,9 @@ class Topology:
                 feature = empty.index_copy(0, place, feature)[:-1]
         else:
             mask = self.adjacency.bool()
-        mask = mask.reshape(-1, size, size)
+        mask = mask.reshape(len(self.adjacency), size, size)
         if self.exists is not None:
-            exists = self.exists.view(-1, size)
+            exists = self.exists.view(len(self.adjacency), size)
             mask = mask & exists.unsqueeze(-1) & exists.unsqueeze(-2)
         return Pairs(mask, weight, feature)
 

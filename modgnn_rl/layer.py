@@ -10,13 +10,13 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 
-from modgnn_rl.aggregation import Hop, Tables, aggregate, call
+from modgnn_rl.aggregation import Hop, Tables, aggregate, call, suited_form
 from modgnn_rl.communication import GraphShift, Laplacian
 from modgnn_rl.errors import InputError
 from modgnn_rl.graph import AGGREGATIONS, Graph, Topology
 from modgnn_rl.tensors import keep_rows, stack_padded
 
-__all__ = ["STARTS", "ModGNNLayer", "Recorder"]
+__all__ = ["STARTS", "ModGNNLayer", "Recorder", "only_finite"]
 
 Submodule = nn.Module | None
 PerHop = Submodule | Sequence[Submodule]
@@ -47,8 +47,8 @@ class ModGNNLayer(nn.Module):
         x_i(t)      = f_final( f_mid^(0)(f_pre^(0)(c_i(t))) + sum_k f_mid^(k)( sum_j f_pre^(k)(y_ij^(k)(t)) ) )
 
     A submodule that is left out is the identity. Each may be a plain module or a TensorDictModule with keys of its own,
-    whose first out-key is the result. It reads ``"data"`` (what a plain module would get; f_com instead ``"sender"``
-    and ``"receiver"``), and anything of
+    whose out-key, or the last of several, is the result. It reads ``"data"`` (what a plain module would get; f_com
+    instead ``"sender"`` and ``"receiver"``), and anything of
 
     - ``("own", name)``: the agent's own data at time t (in f_com and f_pre: the receiver's), for example
       ``("own", "observation")``, or another name that lies beside the observation;
@@ -125,9 +125,20 @@ class ModGNNLayer(nn.Module):
     @property
     def own_keys(self) -> set[tuple[str, ...]]:
         """What the keyed submodules read of the agent's own data, without the leading ``"own"``."""
+        return self._keys_under("own")
+
+    def _keys_under(self, group: str) -> set[tuple[str, ...]]:
         keyed = (module for module in self.submodules if isinstance(module, TensorDictModuleBase))
         keys = {unravel_key(key) for module in keyed for key in module.in_keys}
-        return {key[1:] for key in keys if isinstance(key, tuple) and key[0] == "own"}
+        return {key[1:] for key in keys if isinstance(key, tuple) and key[0] == group}
+
+    @property
+    def results(self) -> list[tuple[str, ...]]:
+        """Names of the intermediate results that a recorder may want, with their hops."""
+        hops = {"messages": range(self.hops), "f_com": range(1, self.hops + 1)}
+        names = ("messages", "f_com", "f_pre", "sum", "f_mid")
+        numbered = [(name, str(hop)) for name in names for hop in hops.get(name, range(self.hops + 1))]
+        return [("f_input",), *numbered, ("f_final",)]
 
     @property
     def sends_plain_data(self) -> bool:
@@ -165,18 +176,25 @@ class ModGNNLayer(nn.Module):
         """
         shape = observation.shape[:-1]
         if isinstance(adjacency, Tensor):
-            adjacency = Topology(adjacency, shape[-1], receivers=receivers)
+            adjacency = Topology(adjacency, shape[-1], receivers=receivers, form=suited_form("auto", self))
         topology, rows = adjacency, adjacency.rows
+        if topology.num_nodes != shape.numel():
+            flocks = topology.num_nodes // max(shape[-1], 1)
+            raise InputError(f"there are {flocks} graphs for observations {list(shape)} of flocks; each needs its own")
+        for (name,) in self._keys_under("link"):
+            if getattr(topology, name, None) is None:
+                raise InputError(f"a submodule reads ('link', '{name}'), and the links have no {name}; see link_{name}")
         flat = {("own", *key): value.flatten(0, len(shape) - 1) for key, value in (own or {}).items()}
-        seen, flat, sees = _only_finite(observation.reshape(shape.numel(), -1), flat)
+        seen, flat, sees = only_finite(observation.reshape(shape.numel(), observation.shape[-1]), flat, topology.exists)
         flat[("input",)] = seen
-        if topology.exists is not None:
-            sees = sees & topology.exists
 
-        data, held = call(self.f_input, seen, flat), sees
+        # Modules may work in place; what they are given here is read again.
+        data, held = _call_for(topology.exists, topology, self.f_input, seen.clone(), flat), sees
         _record(record, "f_input", None, data)
         mine = {key: _take(value, rows) for key, value in flat.items()}
-        total = self._contribution(0, call(self.f_pre[0], _take(data, rows), mine), mine, record)
+        processed = call(self.f_pre[0], _take(data, rows).clone(), mine)
+        _record(record, "f_pre", 0, processed)
+        total = self._contribution(0, processed, mine, None, topology, record)
         first = data  # of start="repeat"
         sent = []
         for hop in range(1, self.hops + 1):
@@ -185,19 +203,19 @@ class ModGNNLayer(nn.Module):
             stored = None if messages is None else messages[..., hop - 1, : data.shape[-1]]
             before, held = _one_step_earlier(data, held, stored, is_init, shape)
             if self.start == "repeat":
-                before, held = torch.where(held.unsqueeze(-1), before, first), held | sees
+                known = sees & first.isfinite().all(-1)
+                before, held = torch.where((held | ~known).unsqueeze(-1), before, first), held | known
             elif self.start == "zero":
                 held = torch.ones_like(held)
             graph = topology.wanted().between(held, _take(held, rows))
             incoming = Hop(before, _take(before, rows), mine)
             summed = self._summed(hop, self.f_pre[hop], graph, incoming, record)
-            contribution = self._contribution(hop, summed, mine, record)
-            total = total + keep_rows(contribution, _take(held, rows))
+            total = total + self._contribution(hop, summed, mine, _take(held, rows), topology, record)
             if hop < self.hops:
                 everyone = topology.everyone()
                 data = self._summed(hop, None, everyone.between(held, held), Hop(before, before, flat))
                 if self.start == "repeat":
-                    first = self._summed(hop, None, everyone.between(sees, sees), Hop(first, first, flat))
+                    first = self._summed(hop, None, everyone.between(known, known), Hop(first, first, flat))
                 if topology.exists is not None:
                     held = held & topology.exists
 
@@ -226,14 +244,25 @@ class ModGNNLayer(nn.Module):
         module = nn.Identity() if f_pre is None else f_pre
         return aggregate(graph, self.f_com[hop - 1], module, incoming, self.aggregation, take)
 
-    def _contribution(self, hop: int, summed: Tensor, mine: Tables, record: Recorder | None) -> Tensor:
-        """F_mid of one hop's sum."""
-        if hop == 0:
-            _record(record, "f_pre", 0, summed)
+    def _contribution(
+        self, hop: int, summed: Tensor, mine: Tables, held: Tensor | None, topology: Topology, record: Recorder | None
+    ) -> Tensor:
+        """F_mid of one hop's sum; zero for agents that hold no such hop."""
         _record(record, "sum", hop, summed)
-        result = call(self.f_mid[hop], summed, mine)
+        result = _call_for(held, topology, self.f_mid[hop], summed, mine)
         _record(record, "f_mid", hop, result)
         return result
+
+
+def _call_for(who: Tensor | None, topology: Topology, module: nn.Module, data: Tensor, own: Tables) -> Tensor:
+    """Apply a submodule for some agents, bool [R], or all; zeros for the others, whose rows no batch statistics see."""
+    if who is None:
+        return call(module, data, own)
+    if topology.as_pairs or who.all():
+        return keep_rows(call(module, data, own), who)
+    rows = who.nonzero().squeeze(-1)
+    result = call(module, _take(data, rows), {key: _take(value, rows) for key, value in own.items()})
+    return result.new_zeros(len(data), *result.shape[1:]).index_copy(0, rows, result)
 
 
 def _take(table: Tensor, rows: Tensor | None) -> Tensor:
@@ -245,9 +274,13 @@ def _record(record: Recorder | None, name: str, hop: int | None, value: Tensor) 
         record.nodes(name, hop, value)
 
 
-def _only_finite(observation: Tensor, own: Tables) -> tuple[Tensor, dict[tuple[str, ...], Tensor], Tensor]:
-    """Zero all data of agents that see anything that is not finite; also returns who sees, bool [R]."""
+def only_finite(
+    observation: Tensor, own: Tables, exists: Tensor | None = None
+) -> tuple[Tensor, dict[tuple[str, ...], Tensor], Tensor]:
+    """Zero all data of agents that see anything not finite or do not exist, bool [R]; also returns the others."""
     sees = observation.isfinite().all(-1)
+    if exists is not None:
+        sees = sees & exists
     for value in own.values():
         sees = sees & value.isfinite().flatten(1).all(-1)
     clean = {key: keep_rows(value, sees) for key, value in own.items()}
@@ -259,15 +292,15 @@ def _one_step_earlier(
 ) -> tuple[Tensor, Tensor]:
     """What the agents [*B, T, N] held one step earlier, [R, D], zero where they held nothing, and who held it [R].
 
-    What was stored comes first in the window; at the start of episodes nobody holds anything.
+    What was stored comes first in the window; at the start of episodes nobody holds anything, and never what is not
+    finite.
     """
     window, holds = data.unflatten(0, shape), held.unflatten(0, shape)
+    stored_held = torch.full_like(holds[..., 0, :], stored is not None)
     if stored is None:
-        stored, stored_held = torch.zeros_like(window[..., 0, :, :]), torch.zeros_like(holds[..., 0, :])
-    else:
-        stored_held = stored.isfinite().all(-1)
+        stored = torch.zeros_like(window[..., 0, :, :])
     before = torch.cat((stored.unsqueeze(-3), window[..., :-1, :, :]), -3)
-    held_before = torch.cat((stored_held.unsqueeze(-2), holds[..., :-1, :]), -2)
+    held_before = torch.cat((stored_held.unsqueeze(-2), holds[..., :-1, :]), -2) & before.isfinite().all(-1)
     if is_init is not None:
         held_before = held_before & ~is_init.unsqueeze(-1)
     before, held_before = before.flatten(0, -2), held_before.flatten()

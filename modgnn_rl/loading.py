@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.models import make_model
+from modgnn_rl.models import configured_model
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.settings import check
@@ -36,7 +36,7 @@ def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = 
     """
     run = RunFolder.open(Path(folder))
     model = _stored(run, "model", ModelConfig)
-    policy = make_model(model.name, model.hops, model.hidden, max_speed=stored_world(run).max_speed, seed=0)
+    policy = configured_model(model, stored_world(run), seed=0)
     checkpoint = load_checkpoint(run.checkpoints)
     try:
         policy.load_state_dict(checkpoint.tensors["policy"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -18,6 +19,7 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.cache import AgentCache, missing
 from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.errors import InputError
 from modgnn_rl.experts import LocalReynolds
 from modgnn_rl.models import make_model
 
@@ -157,6 +159,37 @@ def test_one_policy_flies_flocks_of_any_size() -> None:
         env = remembering(policy, agents)
         assert env.observation_spec["messages"].shape == (FLOCKS, agents, 1, 6)
         assert env.rollout(3, policy, break_when_any_done=False)[ACTION].shape == (FLOCKS, 3, agents, 3)
+
+
+@torch.no_grad()
+def test_a_policy_without_messages_flies_in_the_same_environments() -> None:
+    policy = make_model("central", num_agents=AGENTS, seed=0)
+    flights = remembering(policy).rollout(9, policy, break_when_any_done=False)
+    assert flights["messages"].shape == (FLOCKS, 9, AGENTS, 0, 6)
+    (batch,) = collect(policy, steps=9, batches=1)
+    torch.testing.assert_close(batch[ACTION], flights[ACTION])
+
+
+@torch.no_grad()
+def test_every_key_of_the_memory_may_be_renamed() -> None:
+    names: dict[str, Any] = {"is_init": "begins", "messages": "memory"}
+    policy = make_model("modgnn_mlp", seed=0, **names)
+    env = TransformedEnv(flocking(), InitTracker(init_key="begins"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.append_transform(policy.make_tensordict_primer())
+        flights = env.rollout(9, policy, break_when_any_done=False)
+    expected = remembering(make_model("modgnn_mlp", seed=0))
+    plain = expected.rollout(9, make_model("modgnn_mlp", seed=0), break_when_any_done=False)
+    torch.testing.assert_close(flights[ACTION], plain[ACTION])
+    assert flights["memory"].any()
+
+
+def test_a_policy_that_cannot_run_on_what_the_environment_emits_is_refused() -> None:
+    policy = make_model("modgnn_mlp", adjacency="graph")
+    env = TransformedEnv(flocking(), InitTracker())
+    with pytest.raises(InputError, match=r"'graph' is missing .* by a transform that is appended before"):
+        env.append_transform(policy.make_tensordict_primer()).reset()
 
 
 @torch.no_grad()

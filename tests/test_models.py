@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+from typing import Any
+
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
+from modgnn_rl.configs.schema import MODEL_NAMES, FlockingConfig, ModelConfig
+from modgnn_rl.equivariant import VectorSquash
 from modgnn_rl.errors import InputError
-from modgnn_rl.models import MODELS, BallHead, PairForce, Scale, make_model
+from modgnn_rl.models import MODELS, BallHead, PairForce, Scale, configured_model, make_model
 from modgnn_rl.modgnn import ModGNN
 
 seeds = st.integers(0, 999)
-models = pytest.mark.parametrize("name", MODELS)
+local_models = pytest.mark.parametrize("name", [name for name in MODELS if name != "central"])
+# A name, and a number of layers.
+CASES = [(name, layers) for name in MODELS for layers in ((1,) if name == "central" else (1, 2))]
+models = pytest.mark.parametrize(("name", "layers"), CASES, ids=[f"{name}-{layers}" for name, layers in CASES])
+
+
+def build(name: str, hops: int = 2, agents: int = 5, **options: Any) -> ModGNN:
+    return make_model(name, hops, num_agents=agents, **options)
 
 
 def flight(seed: int, agents: int = 5, steps: int = 4) -> tuple[Tensor, Tensor]:
@@ -40,10 +53,11 @@ def random_rotation(seed: int, determinant: int) -> Tensor:
 
 
 @models
+@settings(max_examples=10)
 @given(seed=seeds, scale=st.sampled_from([0.0, 1.0, 1e3]))
 @torch.no_grad()
-def test_actions_stay_in_the_ball(name: str, seed: int, scale: float) -> None:
-    policy = make_model(name, hops=2, max_speed=0.7, seed=seed).double()
+def test_actions_stay_in_the_ball(name: str, layers: int, seed: int, scale: float) -> None:
+    policy = build(name, layers=layers, max_speed=0.7, seed=seed).double()
     observation, adjacency = flight(seed)
     speed = act(policy, scale * observation, adjacency).norm(dim=-1)
     assert speed.isfinite().all()
@@ -53,10 +67,11 @@ def test_actions_stay_in_the_ball(name: str, seed: int, scale: float) -> None:
 
 
 @models
+@settings(max_examples=10)
 @given(seed=seeds)
 @torch.no_grad()
-def test_absolute_position_is_hidden(name: str, seed: int) -> None:
-    policy = make_model(name, hops=2, seed=seed).double()
+def test_absolute_position_is_hidden(name: str, layers: int, seed: int) -> None:
+    policy = build(name, layers=layers, seed=seed).double()
     observation, adjacency = flight(seed)
     shift = torch.tensor([20.0, -7.0, 3.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     expected = act(policy, observation, adjacency)
@@ -64,10 +79,11 @@ def test_absolute_position_is_hidden(name: str, seed: int) -> None:
     assert not torch.allclose(act(policy, observation + shift.roll(3), adjacency), expected)  # its velocity is not
 
 
-@given(seed=seeds, hops=st.integers(1, 3), determinant=st.sampled_from([1, -1]))
+@settings(max_examples=40)
+@given(seed=seeds, hops=st.integers(1, 3), layers=st.integers(1, 3), determinant=st.sampled_from([1, -1]))
 @torch.no_grad()
-def test_pair_force_turns_with_the_world(seed: int, hops: int, determinant: int) -> None:
-    policy = make_model("pair_force", hops, seed=seed, max_speed=1e3).double()
+def test_pair_force_turns_with_the_world(seed: int, hops: int, layers: int, determinant: int) -> None:
+    policy = make_model("pair_force", hops, seed=seed, max_speed=1e3, layers=layers).double()
     observation, adjacency = flight(seed)
     rotation = random_rotation(seed, determinant)
     turned = (observation.unflatten(-1, (2, 3)) @ rotation).flatten(-2)
@@ -76,7 +92,7 @@ def test_pair_force_turns_with_the_world(seed: int, hops: int, determinant: int)
     torch.testing.assert_close(act(policy, turned, adjacency), action @ rotation)
 
 
-@models
+@local_models
 @torch.no_grad()
 def test_agents_are_interchangeable_and_of_any_number(name: str) -> None:
     policy = make_model(name, hops=1, seed=3).double()
@@ -89,7 +105,7 @@ def test_agents_are_interchangeable_and_of_any_number(name: str) -> None:
         torch.testing.assert_close(permuted, action[:, :, order])
 
 
-@models
+@local_models
 @torch.no_grad()
 def test_who_hears_of_nobody_knows_its_own_velocity_only(name: str) -> None:
     policy = make_model(name, hops=1, seed=0).double()
@@ -106,8 +122,8 @@ def test_who_hears_of_nobody_knows_its_own_velocity_only(name: str) -> None:
 @models
 @pytest.mark.parametrize("case", ["coincident", "at rest", "both"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_are_finite_where_lengths_vanish(name: str, case: str, dtype: torch.dtype) -> None:
-    policy = make_model(name, hops=2, seed=0).to(dtype)
+def test_gradients_are_finite_where_lengths_vanish(name: str, layers: int, case: str, dtype: torch.dtype) -> None:
+    policy = build(name, layers=layers, seed=0).to(dtype)
     observation, adjacency = flight(0)
     if case != "at rest":
         observation[..., 1, :3] = observation[..., 0, :3]
@@ -121,24 +137,45 @@ def test_gradients_are_finite_where_lengths_vanish(name: str, case: str, dtype: 
 
 
 @models
-def test_gradients_reach_every_parameter(name: str) -> None:
-    policy = make_model(name, hops=2, seed=0, max_speed=100.0).double()
-    act(policy, *flight(0)).square().sum().backward()
+def test_gradients_reach_every_parameter(name: str, layers: int) -> None:
+    policy = build(name, layers=layers, seed=0, max_speed=100.0).double()
+    act(policy, *flight(0, steps=6)).square().sum().backward()
     assert all(parameter.grad is not None and parameter.grad.any() for parameter in policy.parameters())
 
 
-def test_counts_of_parameters() -> None:
-    def count(name: str, hops: int, hidden: int) -> int:
-        return sum(parameter.numel() for parameter in make_model(name, hops, hidden).parameters())
-
-    def mlp(inputs: int, hidden: int, outputs: int) -> int:
+@pytest.mark.parametrize(("hops", "hidden"), [(1, 32), (3, 8)])
+def test_counts_of_parameters(hops: int, hidden: int) -> None:
+    def mlp(inputs: int, outputs: int, hidden: int = hidden) -> int:
         return (inputs + 1) * hidden + (hidden + 1) * hidden + (hidden + 1) * outputs
 
-    for hops, hidden in ((1, 32), (3, 8)):
-        per_hop = mlp(6, hidden, 10) + mlp(10, hidden, 10)
-        assert count("modgnn_mlp", hops, hidden) == (hops + 1) * per_hop + mlp(10, hidden, 3)
-        assert count("gcn", hops, hidden) == (hops + 1) * 6 * 3 + 3
-        assert count("pair_force", hops, hidden) == hops * mlp(7, hidden, 3)
+    final = mlp(10, 3)
+    attention = 6 * hidden + hidden  # of differences: one matrix, one score for each of its outputs
+    later_attention = 2 * hidden * hidden + 2 * hidden
+    expected = {
+        "modgnn_mlp": (hops + 1) * (mlp(6, 10) + mlp(10, 10)) + final,
+        "no_pre": (hops + 1) * mlp(6, 10) + final,
+        "no_mid": (hops + 1) * mlp(6, 10) + final,
+        "gcn": (hops + 1) * 6 * 3 + 3,
+        "gcn_final": (hops + 1) * 6 * 10 + 10 + final,
+        "central": (5 * 6 + 1) * hidden + 2 * (hidden + 1) * hidden + (hidden + 1) * 5 * 3,
+        "gat": attention + (hops - 1) * later_attention + mlp(6, 10) + hops * mlp(hidden, 10) + final,
+        "mpnn": mlp(9, hidden) + (hops - 1) * mlp(2 * hidden, hidden) + mlp(6, 10) + hops * mlp(hidden, 10) + final,
+        "pair_force": hops * mlp(7, 3),
+    }
+    assert {name: build(name, hops, hidden=hidden).num_parameters for name in MODELS} == expected
+
+
+def test_the_table_of_models_in_the_documentation_is_true() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "modgnn.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)`(, two layers)? \|[^|]*\| ([\d,]+) \| ([\d,]+) \| ([\d,]+) \|$", page, re.MULTILINE)
+    assert {name for name, *_ in rows} == set(MODELS)
+    for name, two_layers, *counts in rows:
+        models = [make_model(name, hops, layers=2 if two_layers else 1, num_agents=32) for hops in (1, 2, 3)]
+        assert [f"{model.num_parameters:,}" for model in models] == counts, name
+
+
+def test_names_in_the_settings_are_the_models() -> None:
+    assert tuple(MODELS) == MODEL_NAMES
 
 
 @torch.no_grad()
@@ -165,10 +202,70 @@ def test_pair_force_reads_the_receivers_own_velocity() -> None:
 def test_renamed_keys_serve_every_model() -> None:
     observation, adjacency = flight(0)
     for name in MODELS:
-        policy = make_model(name, seed=0, observation="state", adjacency="graph", action="u").double()
+        policy = build(name, seed=0, observation="state", adjacency="graph", action="u").double()
         with set_recurrent_mode(True):
             out = policy(TensorDict({"state": observation, "graph": adjacency}, observation.shape[:2]))
-        torch.testing.assert_close(out["u"], act(make_model(name, seed=0).double(), observation, adjacency))
+        torch.testing.assert_close(out["u"], act(build(name, seed=0).double(), observation, adjacency))
+
+
+@given(seed=seeds)
+@torch.no_grad()
+def test_central_reads_all_agents_now_and_no_graph(seed: int) -> None:
+    policy = build("central", agents=4, seed=seed, max_speed=100.0).double()
+    observation, adjacency = flight(seed, agents=4)
+    action = act(policy, observation, adjacency)
+    torch.testing.assert_close(act(policy, observation, ~adjacency), action)
+    layer = policy.layers[0]
+    centred = observation.clone()
+    centred[..., :3] -= centred[..., :3].mean(-2, keepdim=True)
+    scale = torch.tensor([0.5] * 3 + [1.4] * 3, dtype=torch.float64)
+    expected = layer.network((centred * scale).flatten(-2)).unflatten(-1, (4, 3))
+    torch.testing.assert_close(action, expected)
+
+
+@torch.no_grad()
+def test_central_masks_agents_and_contains_nan() -> None:
+    policy = build("central", agents=4, seed=0).double()
+    observation, adjacency = flight(0, agents=4)
+    exists = torch.ones(2, 4, 4, dtype=torch.bool)
+    exists[0, 1:, 2] = False
+    sick = observation.clone()
+    sick[~exists] = torch.nan
+    window = TensorDict({"agents": {"observation": sick, "mask": exists}, "adjacency": adjacency}, (2, 4))
+    with set_recurrent_mode(True):
+        action = policy(window)["agents", "action"]
+    assert action.isfinite().all()
+    assert not action[~exists].any()
+    torch.testing.assert_close(action[1], act(policy, observation, adjacency)[1])
+
+
+def test_central_serves_one_number_of_agents_and_says_so() -> None:
+    policy = build("central", agents=4, seed=0).double()
+    with pytest.raises(InputError, match="made for 4 agents was given 5"):
+        act(policy, *flight(0, agents=5))
+    with pytest.raises(InputError, match="give num_agents"):
+        make_model("central")
+    with pytest.raises(InputError, match="one layer"):
+        build("central", layers=2)
+    with pytest.raises(InputError, match=r"one number of agents, and env.num_agents=\[8, 16\] asks for more"):
+        configured_model(ModelConfig(name="central"), FlockingConfig(num_agents=[8, 16]), seed=0)
+
+
+@pytest.mark.parametrize("layers", [0, 1.5, None])
+def test_layers_must_be_counted(layers: Any) -> None:
+    with pytest.raises(InputError, match="layers="):
+        make_model("gcn", layers=layers)
+
+
+@torch.no_grad()
+def test_vectors_and_scalars_are_squashed_to_order_one() -> None:
+    data = 50 * torch.randn(9, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    squashed = VectorSquash(2)(data)
+    for part in (slice(0, 3), slice(3, 6)):
+        length, before = squashed[:, part].norm(dim=-1), data[:, part].norm(dim=-1)
+        torch.testing.assert_close(length, before / (1 + before))
+        torch.testing.assert_close(torch.linalg.cross(squashed[:, part], data[:, part]), torch.zeros(9, 3).double())
+    torch.testing.assert_close(squashed[:, 6:], data[:, 6:] / (1 + data[:, 6:].abs()))
 
 
 def test_an_unknown_name_is_refused_with_a_suggestion() -> None:
@@ -177,9 +274,9 @@ def test_an_unknown_name_is_refused_with_a_suggestion() -> None:
 
 
 @models
-def test_a_seed_fixes_the_weights_and_leaves_the_global_generator(name: str) -> None:
+def test_a_seed_fixes_the_weights_and_leaves_the_global_generator(name: str, layers: int) -> None:
     def weights(seed: int | None) -> Tensor:
-        return nn.utils.parameters_to_vector(make_model(name, seed=seed).parameters())
+        return nn.utils.parameters_to_vector(build(name, layers=layers, seed=seed).parameters())
 
     before = torch.get_rng_state()
     first = weights(7)

@@ -326,10 +326,28 @@ def random_step(window: TensorDict) -> TensorDict:
 def test_forgetfulness_warns_once() -> None:
     data = random_data(2, agents=3).exclude("is_init")
     policy = policies()["full"]
-    with pytest.warns(UserWarning, match=r"where episodes begin: append InitTracker\(\)"):
+    with pytest.warns(UserWarning, match=r"remembers nothing: append InitTracker\(\)"):
         policy(data)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         policy(data)
         policies()["hopless"](data.clone())
-        policies()["full"](random_data(2, agents=3))
+
+
+def test_a_step_in_mid_flight_without_messages_warns() -> None:
+    data = random_data(2, agents=3)
+    data["is_init"][:] = True
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        policies()["full"](data.clone())
+    data["is_init"][1] = False
+    with pytest.warns(UserWarning, match="no 'messages' in mid-flight"):
+        policies()["full"](data)
+
+
+@torch.no_grad()
+def test_a_layer_that_sends_nothing_does_not_widen_the_messages() -> None:
+    policy = ModGNN([bare_layer(1), ModGNNLayer(0), bare_layer(2)])
+    assert run_window(policy, random_data(2, 3, agents=3).exclude("is_init"))[1].shape[-1] == 4 * FEATURES
+    last = ModGNN([bare_layer(1), ModGNNLayer(0)])
+    assert run_window(last, random_data(2, 3, agents=3))[1].shape[-2:] == (1, FEATURES)

@@ -261,7 +261,31 @@ def test_some_receivers_of_a_policy_with_keys_and_two_layers(recurrent: bool) ->
         expected, some = policy(data.clone()), policy(data.clone(), wanted)
     action = ("agents", "action")
     torch.testing.assert_close(some[action], expected[action] * wanted.unsqueeze(-1))
-    torch.testing.assert_close(some["next"], expected["next"], equal_nan=True)
+    first, later = some["next", "messages"].split((1, 2), -2)
+    all_first, all_later = expected["next", "messages"].split((1, 2), -2)
+    torch.testing.assert_close(first, all_first)
+    made = later.isfinite()
+    assert made.all() or recurrent  # in a window, of later layers only what the wanted actions depend on
+    torch.testing.assert_close(later[made], all_later[made])
+
+
+@given(hops=st.lists(st.integers(0, 2), min_size=2, max_size=3), seed=st.integers(0, 99))
+def test_layers_make_only_what_the_wanted_actions_depend_on(hops: list[int], seed: int) -> None:
+    torch.manual_seed(seed)
+    policy = ModGNN([make_layer(k, inputs=(1 + index) * FEATURES) for index, k in enumerate(hops)])
+    policy.request("layers.0.f_final")
+    data = as_window(*random_data(2, STEPS))
+    data["adjacency"] = torch.ones(2, STEPS, AGENTS, AGENTS, dtype=torch.bool)
+    wanted = torch.zeros(2, STEPS, AGENTS, dtype=torch.bool)
+    wanted[0, -1, 2] = True
+    with set_recurrent_mode(True):
+        out, whole = policy(data.clone(), wanted), policy(data.clone())
+        torch.testing.assert_close(out["agents", "action"][wanted], whole["agents", "action"][wanted])
+    made = out["layers", "0", "f_final"].any(-1)
+    depth = sum(hops[1:])
+    assert not made[1].any()
+    assert made[0].any(-1).tolist() == [STEPS - 1 - t <= depth for t in range(STEPS)]
+    assert made[0, -1].nonzero().tolist() == [[2]]
 
 
 # Modules and keys.

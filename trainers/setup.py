@@ -5,7 +5,7 @@ from __future__ import annotations
 from modgnn_rl.configs.schema import ImitationConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
-from modgnn_rl.models import make_model
+from modgnn_rl.models import configured_model
 from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.learner import Learner
 
@@ -19,9 +19,7 @@ def make_learner(config: TrainConfig, updates: tuple[int, int]) -> Learner:
         config: the run's settings.
         updates: updates until the first cosine of the learning rate ends, and of the whole run.
     """
-    model = config.model
-    seed = derive_seed(config.seed, "model")
-    policy = make_model(model.name, model.hops, model.hidden, max_speed=config.env.max_speed, seed=seed)
+    policy = configured_model(config.model, config.env, derive_seed(config.seed, "model"))
     return Learner(policy.to(config.device), config.trainer, updates, config.seed)
 
 

@@ -1,0 +1,89 @@
+"""The paper's centralised baseline, as a layer of `modgnn_rl.ModGNN` that needs no messages."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from modgnn_rl.aggregation import Tables
+from modgnn_rl.errors import InputError
+from modgnn_rl.graph import Topology
+from modgnn_rl.layer import Recorder, only_finite
+from modgnn_rl.tensors import keep_rows
+
+__all__ = ["CentralLayer"]
+
+
+class CentralLayer(nn.Module):
+    """A network that reads all agents at once and acts for all: no graph, no delay, one number of agents.
+
+    Positions are taken relative to the mean of the agents, so that it does not matter where the flock is; agents that
+    do not exist, or that see anything that is not finite, are zeros. It is not equivariant to permutations.
+
+    Args:
+        num_agents: N.
+        features: first three columns of an observation are the position.
+        hidden: width of the three hidden layers.
+        outputs: width of an agent's output.
+        scale: multiplies the centred observation, a module [*, F] -> [*, F].
+        head: applied to each agent's output.
+    """
+
+    hops = 0
+    own_keys: frozenset[tuple[str, ...]] = frozenset()
+    sends_plain_data = True
+    results = (("f_final",),)
+
+    def __init__(
+        self, num_agents: int, features: int, hidden: int, outputs: int, *, scale: nn.Module, head: nn.Module
+    ) -> None:
+        super().__init__()
+        self.num_agents, self.outputs = num_agents, outputs
+        self.scale, self.head = scale, head
+        self.network = nn.Sequential(
+            *(nn.Linear(num_agents * features, hidden), nn.ReLU()),
+            *(nn.Linear(hidden, hidden), nn.ReLU()),
+            *(nn.Linear(hidden, hidden), nn.ReLU()),
+            nn.Linear(hidden, num_agents * outputs),
+        )
+
+    def forward(
+        self,
+        observation: Tensor,
+        adjacency: Tensor | Topology,
+        is_init: Tensor | None = None,
+        messages: Tensor | None = None,
+        own: Tables | None = None,
+        *,
+        receivers: Tensor | None = None,
+        record: Recorder | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Run a window; the arguments are those of `ModGNNLayer.forward`, of which only the first is looked at.
+
+        Returns:
+            outputs [*B, T, N, O], and no messages [*B, T, N, 0, F].
+
+        Raises:
+            InputError: for another number of agents than the network was made for.
+        """
+        shape = observation.shape[:-1]
+        if shape[-1] != self.num_agents:
+            raise InputError(
+                f"a central model made for {self.num_agents} agents was given {shape[-1]}; it reads all of them at "
+                "once and serves one number only: train another, or take a model that shares its weights over agents"
+            )
+        topology = adjacency if isinstance(adjacency, Topology) else Topology(adjacency, shape[-1], receivers=receivers)
+        seen, _, sees = only_finite(observation.reshape(shape.numel(), -1), {})
+        there = sees if topology.exists is None else sees & topology.exists
+        flocks = keep_rows(seen, there).unflatten(0, (-1, self.num_agents))
+        counts = there.view(-1, self.num_agents, 1).sum(1, keepdim=True).clamp(min=1)
+        mean = flocks[..., :3].sum(1, keepdim=True) / counts
+        centred = torch.cat((flocks[..., :3] - mean, flocks[..., 3:]), -1).flatten(0, 1)
+        inputs = keep_rows(self.scale(centred), there).view(-1, self.num_agents * centred.shape[-1])
+        output = self.head(self.network(inputs).view(shape.numel(), self.outputs))
+        output = keep_rows(output, sees, torch.nan)
+        if topology.wanted_nodes is not None:
+            output = keep_rows(output, topology.wanted_nodes)
+        if record is not None and record.wants("f_final"):
+            record.nodes("f_final", None, output)
+        return output.unflatten(0, shape), seen.new_zeros(*shape, 0, seen.shape[-1])

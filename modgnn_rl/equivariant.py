@@ -1,0 +1,136 @@
+"""Forces of pairs: an f_pre that turns with the world, and vector messages between layers.
+
+Everything that such a layer reads and writes is made of 3-vectors and scalars, so that a policy of these layers is
+invariant to translations and equivariant to rotations and reflections, whatever its weights.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["PairForce", "VectorSquash", "mlp"]
+
+VELOCITY_SCALE = 1.4  # s/m
+
+
+class PairForce(nn.Module):
+    r"""The force between two agents, equivariant to rotations and reflections.
+
+    With the relative position r u (distance r, unit vector u) and relative velocity w that hop 1 of the Laplacian
+    brings (further hops bring sums of such differences, which are treated alike), and the receiver's own velocity v, a
+    small network maps the invariants to (a, b, c), and the force is ``a u + b w + c v``. Forces are summed over the
+    neighbours, so that a policy trained at one flock size flies at others.
+
+    Behind earlier layers, which put out C vectors and S scalars each, these are compared and combined in the same way:
+    their differences, and the receiver's own.
+
+    Args:
+        hidden: width of the network's two hidden layers.
+        vectors: vectors that the layer puts out.
+        scalars: scalars that the layer puts out, behind the vectors.
+        earlier: number of earlier layers.
+        features: (C, S), what each earlier layer puts out.
+    """
+
+    def __init__(
+        self,
+        hidden: int = 32,
+        *,
+        vectors: int = 1,
+        scalars: int = 0,
+        earlier: int = 0,
+        features: tuple[int, int] = (0, 0),
+    ) -> None:
+        super().__init__()
+        self.vectors, self.scalars, self.earlier, self.features = vectors, scalars, earlier, features
+        further, numbers = 2 * earlier * features[0], 2 * earlier * features[1]
+        self.network = mlp(7 + 4 * further + numbers, hidden, vectors * (3 + further) + scalars)
+
+    def forward(self, relative: Tensor, own: Tensor) -> Tensor:
+        """Forces of links.
+
+        Args:
+            relative: sender minus receiver, one step old: position, m, velocity, m/s, outputs of earlier layers [E, F].
+            own: the receiver's own position, m (unused), velocity, m/s, and outputs of earlier layers, now [E, F].
+
+        Returns:
+            vectors (one: the force, m/s), then scalars [E, 3 V + S].
+        """
+        # Components first: sums over three numbers in a row are several times slower.
+        offset, drift = relative[..., :6].movedim(-1, 0).contiguous().split(3)
+        velocity = own[..., 3:6].movedim(-1, 0).contiguous()
+        distance, drift_speed, own_speed = _norm(offset), _norm(drift), _norm(velocity)
+        unit = offset / distance
+        invariants = [
+            0.7 * distance - 1.2,
+            (distance + 0.05).log(),
+            VELOCITY_SCALE * drift_speed,
+            VELOCITY_SCALE * _dot(unit, drift),
+            VELOCITY_SCALE * own_speed,
+            VELOCITY_SCALE * _dot(velocity, unit),
+            _dot(velocity, drift),
+        ]
+        basis = [unit, drift, velocity]
+        for outputs in (relative, own):
+            vectors, scalars = self._of_earlier_layers(outputs)
+            for vector in vectors:
+                invariants += [_norm(vector), _dot(vector, unit), _dot(vector, drift), _dot(vector, velocity)]
+            basis += vectors
+            invariants += scalars
+        coefficients = self.network(torch.stack(invariants, -1)).unbind(-1)
+        results = []
+        for number in range(self.vectors):
+            own_coefficients = coefficients[number * len(basis) : (number + 1) * len(basis)]
+            force = own_coefficients[0] * unit
+            for coefficient, vector in zip(own_coefficients[1:], basis[1:], strict=True):
+                force = force + coefficient * vector
+            results.append(force)
+        results += [scalar.unsqueeze(0) for scalar in coefficients[self.vectors * len(basis) :]]
+        return torch.cat(results).movedim(0, -1)
+
+    def _of_earlier_layers(self, outputs: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """Vectors [3, E] and scalars [E] that earlier layers put out behind position and velocity."""
+        vectors: list[Tensor] = []
+        scalars: list[Tensor] = []
+        if self.earlier:
+            count, width = self.features[0], 3 * self.features[0] + self.features[1]
+            for block in outputs[..., 6:].movedim(-1, 0).contiguous().split(width):
+                vectors += block[: 3 * count].split(3) if count else ()
+                scalars += block[3 * count :].unbind(0)
+        return vectors, scalars
+
+
+class VectorSquash(nn.Module):
+    """Bring vectors and scalars of any size to order one, equivariantly: ``x / (1 + |x|)`` each.
+
+    Args:
+        vectors: number of vectors V; scalars follow them.
+    """
+
+    def __init__(self, vectors: int) -> None:
+        super().__init__()
+        self.vectors = vectors
+
+    def forward(self, data: Tensor) -> Tensor:
+        """Squash [..., 3 V + S]."""
+        vectors, scalars = data[..., : 3 * self.vectors].unflatten(-1, (-1, 3)), data[..., 3 * self.vectors :]
+        length = (vectors.square().sum(-1, keepdim=True) + 1e-8).sqrt()
+        return torch.cat(((vectors / (1 + length)).flatten(-2), scalars / (1 + scalars.abs())), -1)
+
+
+def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    """Linear-ReLU-Linear-ReLU-Linear, the paper's three-layer network."""
+    return nn.Sequential(
+        nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs)
+    )
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Inner products [...] of vectors with the component first [3, ...]."""
+    return (a * b).sum(0)
+
+
+def _norm(vector: Tensor) -> Tensor:
+    """Lengths [...] of vectors [3, ...], softened so that the gradient exists at zero."""
+    return (_dot(vector, vector) + 1e-8).sqrt()

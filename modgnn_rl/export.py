@@ -1,0 +1,74 @@
+"""``python -m modgnn_rl.export run=<folder>``: the policy of a run as files that fly a robot."""
+
+from __future__ import annotations
+
+import time
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from modgnn_rl.command import run_command
+from modgnn_rl.configs.schema import ExportConfig
+
+if TYPE_CHECKING:
+    from modgnn_rl.exporting import Exported
+    from modgnn_rl.modgnn import ModGNN
+
+NEIGHBOURS = 10  # whose messages come in while the latency is measured
+REPEATS = 300
+
+
+def main(config: ExportConfig) -> None:
+    """Export the policy of a run, agent by agent, to files that fly with numpy and onnxruntime alone."""
+    from modgnn_rl.exporting import export_run
+
+    print(report(*export_run(config)))
+
+
+def report(exported: Exported, policy: ModGNN) -> str:
+    """Sizes, largest difference and latency of an exported agent that reads its observation alone, and how to fly it.
+
+    Args:
+        exported: what `modgnn_rl.exporting.export_agent` made.
+        policy: of this policy.
+    """
+    import torch
+
+    from modgnn_rl.agent import Agent
+    from modgnn_rl.exporting import TOLERANCE
+    from modgnn_rl.onnx_agent import OnnxAgent
+
+    about, dtype = exported.metadata, getattr(torch, exported.metadata["dtype"])
+    observation = torch.zeros(about["observation_width"], dtype=dtype)
+    generator = torch.Generator().manual_seed(0)
+    messages = torch.randn(NEIGHBOURS, about["hops"], about["message_width"], generator=generator, dtype=dtype)
+    eager = latency(Agent(policy), observation, messages)
+    onnx = latency(OnnxAgent(exported.folder), observation.numpy(), messages.numpy())
+    files = sorted(exported.folder.iterdir())
+    frequency = about["control_frequency"]
+    lines = [
+        f"{about['model'] or 'The policy'}, {about['parameters']} parameters, is in {exported.folder}",
+        *(f"  {file.name:<14}{file.stat().st_size / 1000:7.1f} kB" for file in files),
+        f"Largest difference from the policy: {exported.difference:.1e}, at most {TOLERANCE[dtype]:.0e}",
+        f"One step with {NEIGHBOURS} neighbours, median: onnxruntime {onnx:.0f} us, torch {eager:.0f} us",
+        "A robot needs that folder, numpy and onnxruntime. There it flies"
+        + (f", {frequency:g} times a second, by" if frequency else " by"),
+        "  agent = onnx_agent.OnnxAgent('.')",
+        "  message = agent.observe(observation); agent.receive(messages_of_neighbours); action = agent.act()",
+    ]
+    return "\n".join(lines)
+
+
+def latency(agent: Any, observation: Any, messages: Any) -> float:
+    """Median time of a whole step of an agent, microseconds."""
+    times = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        agent.observe(observation)
+        agent.receive(messages)
+        agent.act()
+        times.append(time.perf_counter() - start)
+    return 1e6 * median(times)
+
+
+if __name__ == "__main__":
+    run_command(main, ExportConfig, "export")

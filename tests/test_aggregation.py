@@ -1,0 +1,377 @@
+"""Sums over the neighbours: blocks and recomputation against plain autograd over all links at once."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torch.nn.utils import parametrizations
+from torchrl.modules import set_recurrent_mode
+
+from modgnn_rl import ModGNN, ModGNNLayer, aggregation, graph
+from modgnn_rl.aggregation import Hop, aggregate
+from modgnn_rl.communication import Adjacency, GraphAttention, Laplacian
+from modgnn_rl.graph import Links, Topology
+
+seeds = st.integers(0, 999)
+few = settings(max_examples=15)
+WIDTH = 3
+
+
+def numbers(*shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64)
+
+
+def random_links(senders: int, receivers: int, share: float, **attributes: Tensor) -> Links:
+    """Links between two different sets of nodes, some of which may have none."""
+    receiver, sender = (torch.rand(receivers, senders) < share).nonzero().unbind(-1)
+    return Links(sender, receiver, senders, receivers, **attributes)
+
+
+links = st.builds(
+    lambda senders, receivers, share, seed: (torch.manual_seed(seed), random_links(senders, receivers, share))[1],
+    senders=st.integers(1, 6),
+    receivers=st.integers(0, 6),
+    share=st.sampled_from([0.0, 0.3, 1.0]),
+    seed=seeds,
+)
+
+
+def held_by(links: Links, **own: Tensor) -> Hop:
+    rows = links.num_senders, links.num_receivers
+    senders, receivers = (numbers(count, WIDTH).requires_grad_() for count in rows)
+    return Hop(senders, receivers, {("own", name): value for name, value in own.items()})
+
+
+def results(
+    links: Links, f_com: nn.Module, f_pre: nn.Module, hop: Hop, kind: str, *, at_once: bool = False
+) -> list[Tensor]:
+    """The aggregate, and gradients for tables and weights; ``at_once`` by plain autograd over all links."""
+    value = aggregate(links, f_com, f_pre, hop, kind, (lambda name, rows: None) if at_once else None)
+    tables = [table for table in (hop.senders, hop.receivers, *hop.own.values()) if table.requires_grad]
+    wanted = tables + [weight for module in (f_com, f_pre) for weight in module.parameters() if weight.requires_grad]
+    scale = torch.linspace(0.5, 1.5, value.numel(), dtype=value.dtype).view_as(value)
+    if not value.requires_grad:
+        return [value, *map(torch.zeros_like, wanted)]
+    return [value, *torch.autograd.grad((value * scale).sum(), wanted, allow_unused=True, materialize_grads=True)]
+
+
+def equal(ours: list[Tensor], theirs: list[Tensor], tolerance: float = 1e-12) -> None:
+    for our, their in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(our, their, rtol=tolerance, atol=tolerance)
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Blocks of a few links, none of which are stored for the backward pass."""
+
+    def set_size(size: int) -> None:
+        monkeypatch.setattr(graph, "BLOCK", {"cpu": size})
+        monkeypatch.setattr(aggregation, "STORED_LINKS", 0)
+
+    return set_size
+
+
+class _OwnNumbers(nn.Module):
+    """An f_pre of data, of an embedding of whole numbers, and of further data with two dimensions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear, self.table = nn.Linear(WIDTH + 4, 2), nn.Embedding(5, 2)
+
+    def forward(self, data: Tensor, role: Tensor, arms: Tensor) -> Tensor:
+        return self.linear(torch.cat((data, self.table(role.squeeze(-1)), arms.sum(1)), -1)).tanh()
+
+
+class _Zeros(nn.Module):
+    def forward(self, data: Tensor) -> Tensor:
+        return torch.zeros_like(data)
+
+
+def tanh_network(inputs: int = WIDTH, outputs: int = 2) -> nn.Module:
+    return nn.Sequential(nn.Linear(inputs, 4), nn.Tanh(), nn.Linear(4, outputs)).double()
+
+
+MODULES: dict[str, Callable[[], tuple[nn.Module, nn.Module]]] = {
+    "plain": lambda: (nn.Bilinear(WIDTH, WIDTH, WIDTH), tanh_network()),
+    "attention": lambda: (GraphAttention(WIDTH, 4, 2), nn.Identity()),
+    "keyed": lambda: (
+        Laplacian(),
+        TensorDictModule(_OwnNumbers(), ["data", ("own", "role"), ("own", "arms")], ["out"]),
+    ),
+    "without weights": lambda: (Adjacency(), nn.Tanh()),
+    "in place": lambda: (Adjacency(), nn.Sequential(nn.ReLU(inplace=True), nn.Tanh(), nn.Linear(WIDTH, 2))),
+    "constant": lambda: (Adjacency(), _Zeros()),
+}
+
+
+@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("kind", graph.AGGREGATIONS)
+@settings(max_examples=8)
+@given(links=links, size=st.sampled_from([1, 4, 100]), stored=st.booleans())
+def test_blocks_stored_or_not_are_plain_autograd(name: str, kind: str, links: Links, size: int, stored: bool) -> None:
+    f_com, f_pre = (module.double() for module in MODULES[name]())
+    role, arms = torch.randint(5, (links.num_receivers, 1)), numbers(links.num_receivers, 3, 2).requires_grad_()
+    hop = held_by(links, role=role, arms=arms)
+    expected = results(links, f_com, f_pre, hop, kind, at_once=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(graph, "BLOCK", {"cpu": size})
+        patch.setattr(aggregation, "STORED_LINKS", 1000 if stored else 0)
+        equal(results(links, f_com, f_pre, hop, kind), expected)
+
+
+@few
+@given(links=links, size=st.sampled_from([1, 4, 100]))
+def test_frozen_weights_and_constant_data_have_no_gradient(links: Links, size: int) -> None:
+    f_com, f_pre = nn.Bilinear(WIDTH, WIDTH, WIDTH).double(), tanh_network()
+    f_pre[0].requires_grad_(False)  # type: ignore[index]
+    hop = held_by(links)
+    hop.senders.requires_grad_(False)
+    expected = results(links, f_com, f_pre, hop, "sum", at_once=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(graph, "BLOCK", {"cpu": size})
+        patch.setattr(aggregation, "STORED_LINKS", 0)
+        equal(results(links, f_com, f_pre, hop, "sum"), expected)
+
+
+def test_the_backward_pass_draws_the_same_dropout(small_blocks: Callable[[int], None], monkeypatch) -> None:
+    torch.manual_seed(0)
+    many = random_links(12, 9, 0.5)
+    f_pre = nn.Sequential(nn.Dropout(0.5), tanh_network(), nn.Dropout(0.5))
+    hop = held_by(many)
+    small_blocks(7)
+    torch.manual_seed(1)
+    value = aggregate(many, Laplacian(), f_pre, hop)
+    torch.rand(11)  # others draw in between
+    state = torch.get_rng_state()
+    ours = torch.autograd.grad(value.square().sum(), (hop.senders, hop.receivers, *f_pre.parameters()))
+    assert torch.equal(torch.get_rng_state(), state)
+    monkeypatch.setattr(aggregation, "STORED_LINKS", 1000)
+    torch.manual_seed(1)
+    stored = aggregate(many, Laplacian(), f_pre, hop)
+    theirs = torch.autograd.grad(stored.square().sum(), (hop.senders, hop.receivers, *f_pre.parameters()))
+    equal([value, *ours], [stored, *theirs])
+    assert not torch.allclose(value, aggregate(many, Laplacian(), f_pre, hop))  # drops others now
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_autocast_holds_in_the_backward_pass(
+    inside: bool, small_blocks: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the same weights are used with and without recomputation under one autocast, which caches casts."""
+    torch.manual_seed(0)
+    many = random_links(12, 9, 0.5)
+    f_pre = tanh_network().float()
+    senders, receivers = torch.randn(12, WIDTH).requires_grad_(), torch.randn(9, WIDTH).requires_grad_()
+    wanted = (senders, receivers, *f_pre.parameters())
+    small_blocks(7)
+
+    def gradients(stored: tuple[int, ...]) -> tuple[Tensor, ...]:
+        total = torch.zeros(())
+        with torch.autocast("cpu", torch.bfloat16):
+            for limit in stored:
+                monkeypatch.setattr(aggregation, "STORED_LINKS", limit)
+                value = aggregate(many, Laplacian(), f_pre, Hop(senders, receivers, {}))
+                assert value.dtype == torch.bfloat16
+                total = total + value.float().square().sum()
+            if inside:
+                return torch.autograd.grad(total, wanted)
+        return torch.autograd.grad(total, wanted)
+
+    expected = gradients((1000, 1000))
+    for stored in ((0, 0), (0, 1000), (1000, 0)):
+        for ours, theirs in zip(gradients(stored), expected, strict=True):
+            assert ours.dtype == torch.float32
+            torch.testing.assert_close(ours, theirs, rtol=2e-2, atol=2e-2 * float(theirs.abs().max()))
+
+
+def test_weights_lent_to_a_module_get_the_gradients(small_blocks: Callable[[int], None]) -> None:
+    """As ``functional_call`` and the losses of TorchRL lend them: they are gone when the backward pass runs."""
+    torch.manual_seed(0)
+    f_com, f_pre = nn.Bilinear(WIDTH, WIDTH, WIDTH).double(), tanh_network()
+    both = _Pair(f_com, f_pre)
+    many = random_links(8, 7, 0.5)
+    hop = held_by(many)
+    lent = {name: numbers(*value.shape).requires_grad_() for name, value in both.named_parameters()}
+    at_once = torch.func.functional_call(both, lent, (many, hop, lambda name, rows: None))
+    expected = torch.autograd.grad(at_once.square().sum(), tuple(lent.values()))
+    small_blocks(5)
+    value = torch.func.functional_call(both, lent, (many, hop))
+    equal([value, *torch.autograd.grad(value.square().sum(), tuple(lent.values()))], [at_once, *expected])
+    weights = TensorDict(lent, []).unflatten_keys(".")
+    with weights.to_module(both):
+        value = both(many, hop)
+    equal([value, *torch.autograd.grad(value.square().sum(), tuple(lent.values()))], [at_once, *expected])
+
+
+class _Pair(nn.Module):
+    def __init__(self, f_com: nn.Module, f_pre: nn.Module) -> None:
+        super().__init__()
+        self.f_com, self.f_pre = f_com, f_pre
+
+    def forward(self, links: Links, hop: Hop, record=None) -> Tensor:
+        return aggregate(links, self.f_com, self.f_pre, hop, record=record)
+
+
+def test_a_module_that_changes_as_it_runs_is_run_again_as_it_was(
+    small_blocks: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spectral normalisation takes a step of its power iteration at every call, that is, for every block."""
+    torch.manual_seed(0)
+    f_pre = nn.Sequential(parametrizations.spectral_norm(nn.Linear(WIDTH, 4)), nn.Tanh()).double()
+    many, other = random_links(8, 7, 0.5), copy.deepcopy(f_pre)
+    hop = held_by(many)
+    small_blocks(5)
+    ours = results(many, Laplacian(), f_pre, hop, "sum")
+    monkeypatch.setattr(aggregation, "STORED_LINKS", 1000)
+    equal(ours, results(many, Laplacian(), other, hop, "sum"))
+    equal(list(f_pre.buffers()), list(other.buffers()))
+
+
+class _Twice(nn.Module):
+    """At will an f_com or an f_pre."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(WIDTH, WIDTH)
+
+    def forward(self, data: Tensor, receiver: Tensor | None = None) -> Tensor:
+        return self.linear(data if receiver is None else data - receiver).tanh()
+
+
+@pytest.mark.parametrize("what", ["module", "part", "weight"])
+def test_what_f_com_and_f_pre_share_gets_both_gradients(what: str, small_blocks: Callable[[int], None]) -> None:
+    torch.manual_seed(0)
+    f_com, f_pre = _Twice().double(), _Twice().double()
+    if what == "module":
+        f_pre = f_com
+    elif what == "part":
+        f_pre.linear = f_com.linear
+    else:
+        f_pre.linear.weight = f_com.linear.weight
+    many = random_links(8, 7, 0.5)
+    hop = held_by(many)
+    weights = dict(f_com.named_parameters())
+    expected = results(many, f_com, f_pre, hop, "sum", at_once=True)
+    small_blocks(5)
+    equal(results(many, f_com, f_pre, hop, "sum"), expected)
+    assert all(value is weights[name] for name, value in f_com.named_parameters())
+
+
+@pytest.mark.parametrize("limit", [0, 1000])
+def test_learned_weights_and_features_of_links_get_gradients(
+    limit: int, small_blocks: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(0)
+    bare = random_links(8, 7, 0.5)
+    weight, feature = numbers(len(bare)).requires_grad_(), numbers(len(bare), 2).requires_grad_()
+    many = Links(bare.sender, bare.receiver, 8, 7, weight, feature)
+    f_com = TensorDictModule(_Concatenated(), ["sender", ("link", "weight"), ("link", "feature")], ["y"])
+    hop, f_pre = held_by(many), tanh_network(WIDTH + 3)
+    at_once = aggregate(many, f_com, f_pre, hop, record=lambda name, rows: None)
+    small_blocks(5)
+    monkeypatch.setattr(aggregation, "STORED_LINKS", limit)
+    value = aggregate(many, f_com, f_pre, hop)
+    ours, theirs = (
+        torch.autograd.grad(total.square().sum(), (weight, feature, *f_pre.parameters())) for total in (value, at_once)
+    )
+    equal([value, *ours], [at_once, *theirs])
+
+
+class _Concatenated(nn.Module):
+    def forward(self, *parts: Tensor) -> Tensor:
+        return torch.cat(parts, -1)
+
+
+@pytest.mark.parametrize("form", ["links", "pairs"])
+@pytest.mark.parametrize("kind", graph.AGGREGATIONS)
+@few
+@given(share=st.sampled_from([0.0, 0.4, 1.0]), seed=seeds)
+@torch.no_grad()
+def test_a_layer_aggregates_what_it_processes_and_what_it_passes_on(
+    form: str, kind: str, share: float, seed: int
+) -> None:
+    torch.manual_seed(seed)
+    f_pre = [tanh_network(WIDTH, WIDTH) for _ in range(3)]
+    layer = ModGNNLayer(2, f_pre=f_pre, aggregation=kind).double()
+    observation, adjacency = numbers(3, 4, WIDTH), torch.rand(3, 4, 4) < share
+    output, sent = layer(observation, Topology(adjacency, 4, form=form))
+
+    def over_neighbours(values: Tensor, t: int, i: int) -> Tensor:
+        heard = [values[j] - values[i] for j in range(4) if adjacency[t, i, j]]
+        if not heard:
+            return torch.zeros(1, WIDTH, dtype=torch.float64)
+        return torch.stack(heard)
+
+    def total(rows: Tensor) -> Tensor:
+        return {"sum": rows.sum(0), "mean": rows.mean(0), "max": rows.amax(0)}[kind]
+
+    passed = torch.stack([total(over_neighbours(observation[0], 1, i)) for i in range(4)])
+    torch.testing.assert_close(sent[1, :, 1], passed)
+    for i in range(4):
+        expected = f_pre[0](observation[2, i])
+        for hop, held in ((1, observation[1]), (2, passed)):
+            if adjacency[2, i].any():
+                expected = expected + total(f_pre[hop](over_neighbours(held, 2, i)))
+        torch.testing.assert_close(output[2, i], expected)
+
+
+# Batch statistics see what is there, and nothing else.
+
+
+def statistics() -> nn.BatchNorm1d:
+    return nn.BatchNorm1d(WIDTH, momentum=1.0)
+
+
+@pytest.mark.parametrize("form", ["auto", "links"])
+@few
+@given(share=st.sampled_from([0.3, 0.9]), seed=seeds)
+def test_batch_statistics_are_those_of_real_links_and_agents(form: str, share: float, seed: int) -> None:
+    """Not of padded rows, of pairs without a link, or of hops that an agent does not hold yet."""
+    torch.manual_seed(seed)
+    hops, flocks, steps, agents = 2, 2, 5, 4
+    f_pre, f_mid = ([statistics() for _ in range(hops + 1)] for _ in range(2))
+    layer = ModGNNLayer(hops, statistics(), Laplacian(), f_pre, f_mid, statistics()).double()
+    observation = 5 + numbers(flocks, steps, agents, WIDTH)
+    adjacency = (torch.rand(flocks, steps, agents, agents) < share) | torch.eye(agents).bool()
+    exists = torch.ones(flocks, steps, agents, dtype=torch.bool)
+    if form == "links":
+        exists[0, :, 2:], observation[0, :, 2:] = False, 1e6
+    data = TensorDict({"agents": {"observation": observation}, "adjacency": adjacency}, [flocks, steps])
+    if form == "links":
+        data["agents", "mask"] = exists
+    rows: dict[nn.Module, int] = {}
+    for module in layer.submodules:
+        module.register_forward_pre_hook(lambda module, inputs: rows.update({module: len(inputs[0])}))
+    with set_recurrent_mode(True):
+        ModGNN(layer, form=form)(data)
+
+    linked = adjacency & exists.unsqueeze(-1) & exists.unsqueeze(-2)
+    for module in (layer.f_input, f_pre[0], f_mid[0], layer.f_final):
+        assert rows[module] == int(exists.sum())
+    for hop in (1, 2):
+        assert rows[f_pre[hop]] == int(linked[:, hop:].sum())
+        assert rows[f_mid[hop]] == int(exists[:, hop:].sum())
+    seen = observation[exists]
+    torch.testing.assert_close(layer.f_input.running_mean, seen.mean(0))
+    deviation = (seen.var(0, correction=0) + 1e-5).sqrt()
+    differences = [
+        (observation[flock, t - 1, j] - observation[flock, t - 1, i]) / deviation
+        for flock, t, i, j in linked.nonzero().tolist()
+        if t
+    ]
+    torch.testing.assert_close(f_pre[1].running_mean, torch.stack(differences).mean(0))
+
+
+def test_batch_statistics_pass_through_a_flock_without_links() -> None:
+    seen = statistics()
+    layer = ModGNNLayer(1, f_pre=[None, seen]).double()
+    layer(numbers(3, 2, WIDTH), torch.zeros(3, 2, 2, dtype=torch.bool))[0].sum().backward()
+    assert torch.equal(seen.running_mean, torch.zeros(WIDTH, dtype=torch.float64))
