@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from modgnn_rl.aggregation import Hop, Tables, aggregate, call, suited_form
 from modgnn_rl.communication import GraphShift, Laplacian
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import AGGREGATIONS, Graph, Topology
+from modgnn_rl.graph import AGGREGATIONS, Graph
 from modgnn_rl.tensors import keep_rows, stack_padded
+from modgnn_rl.topology import Topology
 
 __all__ = ["STARTS", "ModGNNLayer", "Recorder", "only_finite"]
 

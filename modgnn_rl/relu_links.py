@@ -61,7 +61,9 @@ def rewrite(graph: Links, f_com: nn.Module, f_pre: nn.Module) -> Rewritten | Non
         incoming = _apply(before, senders)
         own = None
         if is_difference:
-            own = _apply(before, receivers) - _apply(before, receivers.new_zeros(1, receivers.shape[-1]))
+            # W1 m without its bias, which W1 m of the senders has already.
+            mine = incoming if receivers is senders else _apply(before, receivers)
+            own = mine - _apply(before, receivers.new_zeros(1, receivers.shape[-1]))
         weights = [parameter for (layer,) in between for parameter in (layer.weight, layer.bias)]
         total = _ReluOverLinks.apply(graph, incoming, own, *weights)
         return _after_the_sum(graph, after, total)

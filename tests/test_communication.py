@@ -21,7 +21,8 @@ from modgnn_rl.communication import (
     NormalizedAdjacency,
 )
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import Graph, Pairs, Topology
+from modgnn_rl.graph import Graph, Pairs
+from modgnn_rl.topology import Topology
 
 seeds = st.integers(0, 999)
 shares = st.sampled_from([0.0, 0.4, 1.0])

@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from modgnn_rl import ModGNN, ModGNNLayer, graph
+from modgnn_rl import ModGNN, ModGNNLayer, graph, topology
 from modgnn_rl.communication import MessagePassing
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import Links, Pairs, Topology
+from modgnn_rl.graph import Links, Pairs
+from modgnn_rl.topology import Topology
 
 seeds = st.integers(0, 999)
 shares = st.sampled_from([0.0, 0.4, 1.0])
@@ -212,7 +213,7 @@ def outputs_and_gradients(layer: ModGNNLayer, observation: Tensor, topology: Top
     share=shares,
     seed=seeds,
     filling=st.integers(0, 3),
-    form=st.sampled_from(graph.FORMS),
+    form=st.sampled_from(topology.FORMS),
     masked=st.booleans(),
     some=st.booleans(),
     rubbish=st.sampled_from([7.0, torch.nan, torch.inf]),
@@ -257,7 +258,7 @@ def test_every_form_of_a_graph_gives_the_same(
 
 
 @few
-@given(share=shares, seed=seeds, form=st.sampled_from(graph.FORMS))
+@given(share=shares, seed=seeds, form=st.sampled_from(topology.FORMS))
 def test_a_floating_point_adjacency_holds_the_weights(share: float, seed: int, form: str) -> None:
     torch.manual_seed(seed)
     mask = torch.rand(3, 4, 4) < share
@@ -283,7 +284,7 @@ def test_few_agents_most_of_which_are_linked_are_worked_on_in_pairs() -> None:
     assert Topology(some, 4, form="pairs").as_pairs
 
 
-@pytest.mark.parametrize("form", graph.FORMS)
+@pytest.mark.parametrize("form", topology.FORMS)
 @pytest.mark.parametrize(
     ("adjacency", "of_links", "sentence"),
     [
@@ -309,7 +310,7 @@ def test_an_unknown_form_is_refused() -> None:
         ModGNN(ModGNNLayer(1), form="sparse")
 
 
-@pytest.mark.parametrize("form", graph.FORMS)
+@pytest.mark.parametrize("form", topology.FORMS)
 def test_no_links_no_agents_and_no_flocks(form: str) -> None:
     layer = layer_of_links()
     for shape, dense, listed in (
@@ -325,7 +326,7 @@ def test_no_links_no_agents_and_no_flocks(form: str) -> None:
             assert sent.shape == (*shape, 2, 3)
 
 
-@pytest.mark.parametrize("form", graph.FORMS)
+@pytest.mark.parametrize("form", topology.FORMS)
 def test_a_graph_for_other_data_is_refused(form: str) -> None:
     adjacency, layer = torch.ones(3, 3, dtype=torch.bool), ModGNNLayer(1)
     with pytest.raises(InputError, match=r"1 graphs for observations \[4, 3\] of flocks; each needs its own"):

@@ -15,7 +15,8 @@ from torch.nn.utils import parametrizations
 from modgnn_rl import ModGNNLayer, graph, relu_links
 from modgnn_rl.aggregation import Hop, aggregate
 from modgnn_rl.communication import Adjacency, Laplacian
-from modgnn_rl.graph import Links, Topology
+from modgnn_rl.graph import Links
+from modgnn_rl.topology import Topology
 
 seeds = st.integers(0, 999)
 few = settings(max_examples=15)

@@ -19,7 +19,7 @@ from torch.func import functional_call, grad, jvp, stack_module_state, vjp, vmap
 from torch.utils.checkpoint import checkpoint
 from torchrl.modules import set_recurrent_mode
 
-from modgnn_rl import ModGNN, ModGNNLayer, aggregation, graph
+from modgnn_rl import ModGNN, ModGNNLayer, aggregation, graph, topology
 from modgnn_rl.communication import GraphAttention, MessagePassing
 
 FEATURES, AGENTS, STEPS = 2, 4, 4
@@ -314,7 +314,7 @@ def test_copies_keep_keys_requests_and_what_is_shared() -> None:
 
 @settings(max_examples=20)
 @given(
-    form=st.sampled_from(graph.FORMS),
+    form=st.sampled_from(topology.FORMS),
     start=st.sampled_from(["mask", "zero", "repeat"]),
     seed=st.integers(0, 99),
     stored=st.sampled_from([0, 1000]),
