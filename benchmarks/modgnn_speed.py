@@ -23,6 +23,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import tensordict
 import torch
@@ -200,7 +201,7 @@ def windows_table() -> None:
         torch.manual_seed(0)
         policy = sparse_modgnn(DenseModGNN(hops))
         step = random_step(16, 32, hops).exclude("messages")
-        flights = step.unsqueeze(1).expand(-1, 64).contiguous()
+        flights: Any = torch.cat([step.unsqueeze(1)] * 64, 1)
         flights["is_init"][:, 0] = True
 
         def scan(policy: ModGNN = policy, flights: TensorDict = flights) -> Tensor:
