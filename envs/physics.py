@@ -7,34 +7,84 @@ engine can be added here without touching it.
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from modgnn_rl.envs.controller import velocity_controller
-from modgnn_rl.envs.rigid_body import Bodies, step_bodies
-from modgnn_rl.envs.vectors import rotation_matrix, to_body_frame
+from modgnn_rl.compiling import compiled
+from modgnn_rl.envs.controller import Rotors, mix_rotors, rotor_wrench, velocity_controller
+from modgnn_rl.envs.quadcopter import Dynamics
+from modgnn_rl.envs.rigid_body import Bodies, rotor_drag, step_bodies
+from modgnn_rl.envs.vectors import Components, Vector, add, rotation_matrix, to_body_frame
 
-__all__ = ["Physics", "TorchPhysics"]
+__all__ = ["Flight", "Physics", "TorchPhysics", "fly"]
+
+Move = Callable[[Bodies, Tensor, Vector, Dynamics, int, Components | None], Bodies]
 
 
 class Physics(Protocol):
-    """Batched quadcopters that follow target velocities."""
+    """Batched quadcopters that follow target velocities; all vectors are in the world frame."""
 
     @property
     def position(self) -> Tensor:
-        """Positions in the world frame, m [B, N, 3]."""
+        """Positions, m [B, N, 3]."""
+
+    @property
+    def quaternion(self) -> Tensor:
+        """Attitudes from body to world, x, y, z, w [B, N, 4]."""
 
     @property
     def velocity(self) -> Tensor:
-        """Velocities in the world frame, m/s [B, N, 3]."""
+        """Velocities, m/s [B, N, 3]."""
 
-    def reset(self, rows: Tensor, position: Tensor, velocity: Tensor) -> None:
-        """Put the flocks ``rows`` (indices [R]) level at positions [R, N, 3], m, with velocities [R, N, 3], m/s."""
+    @property
+    def spin(self) -> Tensor:
+        """Angular velocities, rad/s [B, N, 3]."""
 
-    def step(self, target_velocity: Tensor) -> None:
-        """Fly one control period towards target velocities [B, N, 3], m/s."""
+    def reset(
+        self,
+        rows: Tensor,
+        position: Tensor,
+        velocity: Tensor,
+        quaternion: Tensor | None = None,
+        spin: Tensor | None = None,
+    ) -> None:
+        """Put the flocks ``rows`` (indices [R]) somewhere, their rotors at hover thrust.
+
+        Args:
+            rows: numbers of flocks, int64 [R].
+            position: m [R, N, 3].
+            velocity: m/s [R, N, 3].
+            quaternion: x, y, z, w, of any length [R, N, 4]; default: level.
+            spin: rad/s [R, N, 3]; default: none.
+        """
+
+    def step(self, target_velocity: Tensor, push: Tensor | None = None) -> None:
+        """Fly one control period.
+
+        Args:
+            target_velocity: m/s [B, N, 3].
+            push: acceleration from outside, such as wind, m/s^2, broadcast to [B, N, 3].
+        """
+
+    def close(self) -> None:
+        """Free what the engine holds."""
+
+
+class Flight(NamedTuple):
+    """State of quadcopters in flight, as structures of arrays.
+
+    Attributes:
+        bodies: position, attitude and motion.
+        integral: integrated velocity error of the controller, m.
+        rotors: thrusts of the rotors, N; empty where they follow their commands at once.
+    """
+
+    bodies: Bodies
+    integral: Vector
+    rotors: Rotors | tuple[()]
 
 
 class TorchPhysics:
@@ -43,9 +93,7 @@ class TorchPhysics:
     Args:
         num_envs: flocks B.
         num_agents: agents N in each.
-        control_frequency: control steps a second, Hz.
-        substeps: physics steps in a control step.
-        velocity_gain: proportional gain of the velocity controller, 1/s.
+        dynamics: how they are controlled and moved.
         device: where the state lives.
         dtype: floating-point type of the state.
     """
@@ -54,71 +102,119 @@ class TorchPhysics:
         self,
         num_envs: int,
         num_agents: int,
+        dynamics: Dynamics | None = None,
         *,
-        control_frequency: float = 48.0,
-        substeps: int = 5,
-        velocity_gain: float = 1.0,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        self.period = 1.0 / control_frequency
-        self.substeps = substeps
-        self.velocity_gain = velocity_gain
-        zeros = torch.zeros(3, num_envs, num_agents, device=device, dtype=dtype)
-        level = torch.zeros(4, num_envs, num_agents, device=device, dtype=dtype)
-        level[3] = 1.0
-        self.bodies = Bodies(zeros, level, zeros, zeros)
-        self.integral = zeros
+        self.dynamics = dynamics or Dynamics()
+        self._fly = fly
+        zero = torch.zeros(num_envs, num_agents, device=device, dtype=dtype)
+        nothing = (zero, zero, zero)
+        hover = torch.full_like(zero, self.dynamics.vehicle.hover_thrust)
+        rotors = (hover, hover, hover, hover) if self.dynamics.motor_lag else ()
+        self.flight = Flight(Bodies(nothing, (*nothing, torch.ones_like(zero)), nothing, nothing), nothing, rotors)
 
     @property
     def position(self) -> Tensor:
-        """Positions in the world frame, m [B, N, 3]."""
-        return self.bodies.position.movedim(0, -1).contiguous()
+        """Positions, m [B, N, 3]."""
+        return self._emit(self.flight.bodies.position)
+
+    @property
+    def quaternion(self) -> Tensor:
+        """Attitudes from body to world, x, y, z, w [B, N, 4]."""
+        return self._emit(self.flight.bodies.quaternion)
 
     @property
     def velocity(self) -> Tensor:
-        """Velocities in the world frame, m/s [B, N, 3]."""
-        return self.bodies.velocity.movedim(0, -1).contiguous()
+        """Velocities, m/s [B, N, 3]."""
+        return self._emit(self.flight.bodies.velocity)
 
-    def reset(self, rows: Tensor, position: Tensor, velocity: Tensor) -> None:
-        """Put the flocks ``rows`` (indices [R]) level at positions [R, N, 3], m, with velocities [R, N, 3], m/s."""
-        level = position.new_tensor((0.0, 0.0, 0.0, 1.0)).view(4, 1, 1)
-        zero = torch.zeros((), dtype=position.dtype, device=position.device)
-        fresh = Bodies(position.movedim(-1, 0), level, velocity.movedim(-1, 0), zero)
-        self.bodies = Bodies(*(_replace(old, rows, new) for old, new in zip(self.bodies, fresh, strict=True)))
-        self.integral = _replace(self.integral, rows, zero)
+    @property
+    def spin(self) -> Tensor:
+        """Angular velocities, rad/s [B, N, 3]."""
+        return self._emit(self.flight.bodies.spin)
 
-    def step(self, target_velocity: Tensor) -> None:
-        """Fly one control period towards target velocities [B, N, 3], m/s."""
-        self.bodies, self.integral = fly(
-            self.bodies, self.integral, target_velocity.movedim(-1, 0), self.period, self.substeps, self.velocity_gain
+    def reset(
+        self,
+        rows: Tensor,
+        position: Tensor,
+        velocity: Tensor,
+        quaternion: Tensor | None = None,
+        spin: Tensor | None = None,
+    ) -> None:
+        """Put the flocks ``rows`` somewhere, see `Physics.reset`."""
+        nothing = torch.zeros_like(position)
+        level = torch.cat((nothing, torch.ones_like(position[..., :1])), -1)
+        hover = torch.full_like(level, self.dynamics.vehicle.hover_thrust)
+        bodies, integral, rotors = self.flight
+        attitude = level if quaternion is None else quaternion / quaternion.norm(dim=-1, keepdim=True)
+        fresh = (position, attitude, velocity, nothing if spin is None else spin)
+        self.flight = Flight(
+            Bodies(*(_replace(old, rows, new) for old, new in zip(bodies, fresh, strict=True))),
+            _replace(integral, rows, nothing),
+            _replace(rotors, rows, hover) if rotors else (),
         )
+
+    def step(self, target_velocity: Tensor, push: Tensor | None = None) -> None:
+        """Fly one control period, see `Physics.step`."""
+        air = None if push is None else push.unbind(-1)
+        self.flight = self._fly(self.flight, target_velocity.unbind(-1), air, self.dynamics)
+
+    def compile(self) -> None:
+        """Compile a control period into one function."""
+        self._fly = compiled(fly)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _emit(self, components: Components) -> Tensor:
+        """A part of the state as a tensor [B, N, C]."""
+        return torch.stack(tuple(components), -1)
 
 
 def fly(
-    bodies: Bodies, integral: Tensor, target: Tensor, period: float, substeps: int, gain: float
-) -> tuple[Bodies, Tensor]:
+    flight: Flight, target: Components, push: Components | None, dynamics: Dynamics, move: Move = step_bodies
+) -> Flight:
     """One control period: the controller once, then the rigid bodies in substeps, as a pure function.
 
     Args:
-        bodies: state of the quadcopters, components first (see `Bodies`).
-        integral: integrated velocity error, m [3, ...].
-        target: target velocity, m/s [3, ...].
-        period: control period, s.
-        substeps: physics steps in it.
-        gain: proportional gain of the velocity controller, 1/s.
+        flight: the state.
+        target: target velocity, m/s.
+        push: acceleration from outside, m/s^2.
+        dynamics: how quadcopters are controlled and moved.
+        move: what moves rigid bodies, with the arguments of `modgnn_rl.envs.rigid_body.step_bodies`.
 
     Returns:
-        the new bodies and the new integral.
+        the new state.
     """
+    bodies, integral, rotors = flight
     rotation = rotation_matrix(bodies.quaternion)
     rate = to_body_frame(rotation, bodies.spin)
-    thrust, torque, integral = velocity_controller(target, bodies.velocity, rotation, rate, integral, period, gain)
-    return step_bodies(bodies, thrust, torque, period / substeps, substeps), integral
+    thrust, torque, integral = velocity_controller(
+        target, bodies.velocity, rotation, rate, integral, dynamics.period, dynamics.velocity_gain, dynamics.vehicle
+    )
+    commands = mix_rotors(thrust, torque, dynamics.vehicle)
+    if not rotors and not dynamics.drag:
+        wrench = rotor_wrench(commands, dynamics.vehicle)
+        return Flight(move(bodies, *wrench, dynamics, dynamics.substeps, push), integral, ())
+    for _ in range(dynamics.substeps):
+        thrusts = _follow(rotors, commands, dynamics.lag) if rotors else commands
+        rotors = thrusts if rotors else ()
+        pushed = push
+        if dynamics.drag:
+            pushed = rotor_drag(bodies, thrusts, dynamics)
+            pushed = pushed if push is None else add(pushed, push)
+        bodies = move(bodies, *rotor_wrench(thrusts, dynamics.vehicle), dynamics, 1, pushed)
+    return Flight(bodies, integral, rotors)
 
 
-def _replace(old: Tensor, rows: Tensor, new: Tensor) -> Tensor:
-    """A copy of ``old`` [C, B, N] with the flocks ``rows`` replaced."""
-    out = old.clone()
-    out[:, rows] = new
-    return out
+def _follow(rotors: Rotors, commands: Rotors, lag: float) -> Rotors:
+    """Thrusts of rotors after a physics step, a share ``lag`` of the difference from their commands being left."""
+    first, second, third, fourth = (c + lag * (f - c) for f, c in zip(rotors, commands, strict=True))
+    return first, second, third, fourth
+
+
+def _replace(old: Components, rows: Tensor, new: Tensor) -> Any:
+    """Components [B, N] with those of the flocks ``rows`` taken from ``new`` [R, N, C]."""
+    return tuple(part.index_copy(0, rows, value) for part, value in zip(old, new.unbind(-1), strict=True))
