@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,22 +12,30 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, MarlGroupMapType
 
-from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig
+from modgnn_rl.compiling import compiled
+from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, as_list
+from modgnn_rl.envs.faults import Faults
+from modgnn_rl.envs.leader import make_leader
 from modgnn_rl.envs.physics import Physics, TorchPhysics
+from modgnn_rl.envs.quadcopter import Dynamics
+from modgnn_rl.envs.radio import hear_all_pairs, hear_near_pairs
 from modgnn_rl.envs.rewards import flocking_reward
-from modgnn_rl.envs.starts import uniform_ball
+from modgnn_rl.envs.starts import start_positions
 from modgnn_rl.errors import InputError
 from modgnn_rl.metrics import is_diverged
+from modgnn_rl.seeds import derive_seed
 from modgnn_rl.settings import check, suggestion
-from modgnn_rl.tensors import clip_to_ball, pair_distances
+from modgnn_rl.tensors import clip_to_ball
 
 __all__ = ["FlockingEnv", "make_physics"]
+
+AWAY = 1e4  # m; where agents that do not exist are kept, as far from each other
 
 
 class FlockingEnv(EnvBase):
     """Flocks of quadcopters behind a leader, as a batch-locked TorchRL environment.
 
-    Agent 0 is the leader: whatever the policy says, its target velocity is integrated Gaussian noise. Nothing in its
+    Agent 0 is the leader: whatever the policy says, it flies as `modgnn_rl.envs.leader` tells it. Nothing in its
     observation marks it. The others fly at the policy's target velocities, projected onto the ball of ``max_speed``.
 
     Keys, with B flocks and N agents:
@@ -35,32 +44,45 @@ class FlockingEnv(EnvBase):
     - ``("agents", "action")`` [B, N, 3]: target velocity, m/s, world frame;
     - ``("agents", "controlled")`` [B, N] bool: the agents that the policy flies; losses and errors count only these;
     - ``("agents", "reward")`` [B, N, 1]: see `modgnn_rl.envs.rewards`;
-    - ``adjacency`` [B, N, N] bool: entry i, j says that i receives from j; zero diagonal;
+    - ``adjacency`` [B, N, N] bool: entry i, j says that i receives from j; zero diagonal. With ``graph="links"``
+      a list of links, int64 [B, 2, E]: senders, below them receivers, filled up with -1; E is ``max_links`` N;
     - ``done``, ``terminated``, ``truncated`` [B, 1] bool. A flock is truncated after ``max_steps``. It is terminated
       when it has diverged (an agent is farther than ``max_distance`` from the centre of mass) or has collided beyond
-      use (more than the share ``max_colliding`` of its agents are within ``collision_distance`` of another).
+      use (more than the share ``max_colliding`` of its agents are within ``collision_distance`` of another);
+    - ``("agents", "state")`` [B, N, 6]: the true position and velocity, where sensors are noisy or late;
+    - ``("agents", "mask")`` [B, N] bool: the agents that are there, where agents drop out or flocks differ in size.
+
+    ``reset(tensordict, set_state=True)`` begins the flights at the positions and velocities under
+    ``("agents", "state")``, or else under ``("agents", "observation")``.
 
     Args:
         num_envs: number of flocks B.
-        num_agents: agents N in each flock; default: the configuration's.
+        num_agents: agents N in each flock; default: the configuration's. With several numbers, flocks take them in
+            turns, N is the largest, and the rows that are left over are masked and zero.
         config: all other settings; default: ``FlockingConfig(**settings)``.
-        seed: seed of the environment's own generator; equal seeds give equal flights, bit for bit.
+        seed: seed of the environment's own generators; equal seeds give equal flights, bit for bit.
         device: where the environment lives.
         dtype: floating-point type of the physics and of everything emitted.
         stagger: let each flock's first episode end at a random step, so that a batch of long-lived flocks holds all
             phases of the flight at once.
         settings: fields of `FlockingConfig`, when no ``config`` is given.
 
+    Attributes:
+        physics: the engine.
+        target_velocity: what the agents were told last, the leader included, m/s [B, N, 3].
+        generator, faults.generator: where starts and leaders come from; where faults come from.
+
     Raises:
-        InputError: on a setting out of range, or an action that is not finite.
+        InputError: on a setting out of range, an action of another shape or not finite, or a state that is no number.
     """
 
     group_map: dict[str, list[str]]
+    _supports_set_state = True
 
     def __init__(
         self,
         num_envs: int,
-        num_agents: int | None = None,
+        num_agents: int | Sequence[int] | None = None,
         *,
         config: FlockingConfig | None = None,
         seed: int | None = None,
@@ -69,47 +91,55 @@ class FlockingEnv(EnvBase):
         stagger: bool = False,
         **settings: Any,
     ) -> None:
-        if config is not None and settings:
-            raise InputError(f"give either a config or settings, not both: {', '.join(settings)}")
-        known = [field.name for field in dataclasses.fields(FlockingConfig)]
-        for name in settings:
-            if name not in known:
-                raise InputError(f"FlockingEnv has no setting {name}{suggestion(name, known)}")
-        self.config = config if config is not None else FlockingConfig(**settings)
-        self.num_agents = self.config.num_agents if num_agents is None else num_agents
-        check(self.config, "env")
-        for name, count in (("num_envs", num_envs), ("num_agents", self.num_agents)):
-            if not isinstance(count, int) or count < 1:
-                raise InputError(
-                    f"{name}={count!r} is not a positive integer; one environment holds flocks of one size"
-                )
+        self.config = _checked_config(config, settings)
+        sizes = as_list(self.config.num_agents if num_agents is None else num_agents)
+        for name, counts in (("num_envs", [num_envs]), ("num_agents", sizes)):
+            for count in counts:
+                if not isinstance(count, int) or count < 1:
+                    raise InputError(f"{name}={count!r} is not a positive integer")
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.dtype = dtype
+        self.num_agents = max(sizes)
+        self.sizes = torch.tensor([sizes[index % len(sizes)] for index in range(num_envs)], device=self.device)
+        self.exists = torch.arange(self.num_agents, device=self.device) < self.sizes.unsqueeze(-1)
+        self.is_mixed = not bool(self.exists.all())
         self.physics = make_physics(self.config, num_envs, self.num_agents, self.device, dtype)
-        self.leader_velocity = torch.zeros(num_envs, 3, device=self.device, dtype=dtype)
+        self.leader = make_leader(self.config, num_envs, self.device, dtype)
+        self.faults = Faults(self.config, num_envs, self.num_agents, self.device, dtype)
+        self.target_velocity = torch.zeros(num_envs, self.num_agents, 3, device=self.device, dtype=dtype)
         self.step_count = torch.zeros(num_envs, 1, device=self.device, dtype=torch.long)
-        self.controlled = torch.ones(num_envs, self.num_agents, device=self.device, dtype=torch.bool)
-        self.controlled[:, 0] = False
+        self._hear_all_pairs, self._judge = hear_all_pairs, judge
         self._stagger_next_reset = stagger
         self._make_specs()
         self.group_map = MarlGroupMapType.ALL_IN_ONE_GROUP.get_group_map(
             [f"agent_{index}" for index in range(self.num_agents)]
         )
         self.generator = torch.Generator(device=self.device)
-        self.generator.manual_seed(self.generator.seed() if seed is None else seed)
+        self._set_seed(self.generator.seed() if seed is None else seed)
+        if self.config.compile:
+            self.compile()
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether agents may be absent, so that ``("agents", "mask")`` is emitted."""
+        return self.is_mixed or self.config.dropout_rate > 0
 
     def _make_specs(self) -> None:
         batch, agents = self.batch_size, (*self.batch_size, self.num_agents)
         real = {"device": self.device, "dtype": self.dtype}
         flag = {"device": self.device, "dtype": torch.bool}
-        group = Composite(
-            observation=Unbounded((*agents, 6), **real),
-            controlled=Binary(shape=agents, **flag),
-            shape=batch,
-        )
-        self.observation_spec = Composite(
-            agents=group, adjacency=Binary(shape=(*agents, self.num_agents), **flag), shape=batch
-        )
+        seen: dict[str, Any] = {
+            "observation": Unbounded((*agents, 6), **real),
+            "controlled": Binary(shape=agents, **flag),
+        }
+        if self.config.hides_state:
+            seen["state"] = Unbounded((*agents, 6), **real)
+        if self.has_mask:
+            seen["mask"] = Binary(shape=agents, **flag)
+        adjacency: Any = Binary(shape=(*agents, self.num_agents), **flag)
+        if self.config.graph == "links":
+            adjacency = Bounded(-1, self.num_agents - 1, (*batch, 2, self._room), device=self.device, dtype=torch.int64)
+        self.observation_spec = Composite(agents=Composite(**seen, shape=batch), adjacency=adjacency, shape=batch)
         speed = self.config.max_speed
         action = Bounded(-speed, speed, (*agents, 3), **real)
         self.full_action_spec = Composite(agents=Composite(action=action, shape=batch), shape=batch)
@@ -118,51 +148,95 @@ class FlockingEnv(EnvBase):
         done = {name: Binary(shape=(*batch, 1), **flag) for name in ("done", "terminated", "truncated")}
         self.full_done_spec = Composite(**done, shape=batch)
 
+    @property
+    def _room(self) -> int:
+        return self.num_agents * min(self.config.max_links, max(1, self.num_agents - 1))
+
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.generator.manual_seed(seed)
+            self.faults.generator.manual_seed(derive_seed(seed, "faults"))
 
-    def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None, *, set_state: bool = False, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = self.done_spec["done"].one() if mask is None else mask
         rows = mask.view(-1).nonzero().view(-1)
-        config, size = self.config, self.num_agents
-        radius = config.start_radius * (size / REFERENCE_SIZE) ** (1 / 3)
-        start = uniform_ball(len(rows), size, radius, config.start_distance, generator=self.generator, dtype=self.dtype)
-        self.physics.reset(rows, start, torch.zeros_like(start))
-        self.leader_velocity = self.leader_velocity.masked_fill(mask, 0.0)
+        if set_state and tensordict is not None:
+            position, velocity = self._given_state(tensordict)[rows].split(3, -1)
+        else:
+            position = self._start(rows)
+            velocity = torch.zeros_like(position)
+        self.physics.reset(rows, position, velocity)
+        self.leader.reset(mask, self.generator)
+        self.target_velocity = self.target_velocity.masked_fill(mask.unsqueeze(-1), 0.0)
         self.step_count = self.step_count.masked_fill(mask, 0)
         if self._stagger_next_reset:
             self._stagger_next_reset = False
             self.step_count = torch.randint(
-                config.max_steps, self.step_count.shape, generator=self.generator, device=self.device
+                self.config.max_steps, self.step_count.shape, generator=self.generator, device=self.device
             )
         position, velocity = self.physics.position, self.physics.velocity
-        return self._emit(position, velocity, pair_distances(position)).update(self.full_done_spec.zero())
+        state = torch.cat((position, velocity), -1)
+        self.faults.reset(mask, state)
+        return self._emit(state, self._hear(position)[0], is_new=False).update(self.full_done_spec.zero())
+
+    def _start(self, rows: Tensor) -> Tensor:
+        """Where the agents of the flocks ``rows`` [R] start, m [R, N, 3]."""
+        config = self.config
+        radius = config.start_radius * (self.sizes[rows] / REFERENCE_SIZE).to(self.dtype) ** (1 / 3)
+        position = start_positions(
+            config.start,
+            len(rows),
+            self.num_agents,
+            radius if self.is_mixed else config.start_radius * (self.num_agents / REFERENCE_SIZE) ** (1 / 3),
+            config.start_distance,
+            config.start_clusters,
+            generator=self.generator,
+            dtype=self.dtype,
+            exists=self.exists[rows] if self.is_mixed else None,
+        )
+        return self._send_away(position, self.exists[rows])
+
+    def _send_away(self, position: Tensor, exists: Tensor) -> Tensor:
+        """Positions [R, N, 3] with those of agents that do not exist where they meet nobody."""
+        if not self.is_mixed:
+            return position
+        away = torch.arange(1, self.num_agents + 1, device=self.device, dtype=self.dtype) * AWAY
+        return torch.where(exists.unsqueeze(-1), position, away.unsqueeze(-1))
+
+    def _given_state(self, tensordict: TensorDictBase) -> Tensor:
+        """The state to begin from, [B, N, 6]."""
+        agents = tensordict.get("agents", TensorDict())
+        state = agents.get("state", agents.get("observation", None))
+        expected = (*self.batch_size, self.num_agents, 6)
+        if state is None or tuple(state.shape) != expected:
+            found = "nothing" if state is None else f"shape {tuple(state.shape)}"
+            raise InputError(
+                f"reset(..., set_state=True) needs positions and velocities of shape {expected} under "
+                f"('agents', 'state'); there is {found}"
+            )
+        self._refuse_nonfinite(state, self.exists, "state", "give finite positions, m, and velocities, m/s")
+        state = state.to(self.dtype)
+        return torch.cat((self._send_away(state[..., :3], self.exists), state[..., 3:]), -1)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         config = self.config
-        action = tensordict["agents", "action"]
-        self._refuse_nonfinite(action)
-        step = config.leader_noise * config.control_frequency**-0.5
-        noise = torch.randn(self.leader_velocity.shape, generator=self.generator, device=self.device, dtype=self.dtype)
-        self.leader_velocity = clip_to_ball(self.leader_velocity + step * noise, config.leader_max_speed)
-        target = torch.where(
-            self.controlled.unsqueeze(-1),
-            clip_to_ball(action.to(self.dtype), config.max_speed),
-            self.leader_velocity.unsqueeze(-2),
-        )
-        self.physics.step(target)
+        push = self.faults.step()
+        flown = self._controlled()
+        action = self._checked_action(tensordict["agents", "action"], flown)
+        target = torch.where(flown.unsqueeze(-1), clip_to_ball(action, config.max_speed), 0.0)
+        target[:, 0] = self.leader.step(self.physics.position[:, 0], self.generator)
+        self.target_velocity = target
+        self.physics.step(target, push)
         self.step_count = self.step_count + 1
 
         position, velocity = self.physics.position, self.physics.velocity
-        distances = pair_distances(position)
-        touching = distances < config.collision_distance
-        colliding = touching.any(-1).to(self.dtype).mean(-1) > config.max_colliding
-        terminated = (is_diverged(position, config.max_distance) | colliding).unsqueeze(-1)
+        adjacency, touching = self._hear(position)
+        exists = self.exists if self.is_mixed else None
+        limits = config.max_distance, config.max_colliding
+        state, reward, terminated = self._judge(position, velocity, touching, self.sizes, exists, limits)
         truncated = self.step_count >= config.max_steps
-        reward = flocking_reward(position, velocity, touching)
-        return self._emit(position, velocity, distances).update(
+        return self._emit(state, adjacency).update(
             {
                 "agents": {"reward": reward},
                 "terminated": terminated,
@@ -171,25 +245,71 @@ class FlockingEnv(EnvBase):
             }
         )
 
-    def _emit(self, position: Tensor, velocity: Tensor, distances: Tensor) -> TensorDict:
-        agents = TensorDict(
-            {"observation": torch.cat((position, velocity), -1), "controlled": self.controlled.clone()},
+    def _controlled(self) -> Tensor:
+        """The agents that the policy flies now, bool [B, N]."""
+        controlled = self.exists & self.faults.running
+        controlled[:, 0] = False
+        return controlled
+
+    def _hear(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """The graph, and the agents that touch another [B, N]."""
+        config, faults = self.config, self.faults
+        taking_part = self.exists & faults.running if self.has_mask else None
+        if config.graph == "links":
+            return hear_near_pairs(position, faults, taking_part, config.collision_distance, self._room)
+        reach = config.comm_range if faults.reach is None else faults.reach
+        adjacency, touching = self._hear_all_pairs(position, reach, config.collision_distance)
+        if taking_part is not None:
+            adjacency &= taking_part.unsqueeze(-1) & taking_part.unsqueeze(-2)
+        arrived = faults.arrived(*adjacency.shape)
+        return adjacency if arrived is None else adjacency & arrived, touching
+
+    def _emit(self, state: Tensor, adjacency: Tensor, *, is_new: bool = True) -> TensorDict:
+        if self.is_mixed:
+            state = state.masked_fill(~self.exists.unsqueeze(-1), 0.0)
+        agents = {"observation": self.faults.observe(state, is_new=is_new), "controlled": self._controlled()}
+        if self.config.hides_state:
+            agents["state"] = state
+        if self.has_mask:
+            agents["mask"] = self.exists & self.faults.running
+        return TensorDict(
+            {"agents": TensorDict(agents, self.batch_size, device=self.device), "adjacency": adjacency},
             self.batch_size,
             device=self.device,
         )
-        return TensorDict(
-            {"agents": agents, "adjacency": distances <= self.config.comm_range}, self.batch_size, device=self.device
-        )
 
-    def _refuse_nonfinite(self, action: Tensor) -> None:
-        bad = ~action.isfinite().all(-1) & self.controlled
+    def _checked_action(self, action: Tensor, flown: Tensor) -> Tensor:
+        expected = (*self.batch_size, self.num_agents, 3)
+        if tuple(action.shape) != expected:
+            raise InputError(
+                f"the action has shape {tuple(action.shape)}; this environment expects {expected}: a target velocity, "
+                "m/s, for each agent of each flock"
+            )
+        self._refuse_nonfinite(action, flown, "action", "a policy must give three finite numbers, m/s")
+        return action.to(self.dtype)
+
+    def _refuse_nonfinite(self, value: Tensor, counts: Tensor, name: str, remedy: str) -> None:
+        """Refuse values [B, N, D] that are not finite in agents that count, bool [B, N]."""
+        if value.isfinite().all():
+            return
+        bad = ~value.isfinite().all(-1) & counts
         if bad.any():
             flock, agent = bad.nonzero()[0].tolist()
             step = int(self.step_count[flock])
             raise InputError(
-                f"the action of agent {agent} in flock {flock} at step {step} is not finite "
-                f"({action[flock, agent].tolist()}); a policy must give three finite numbers, m/s"
+                f"the {name} of agent {agent} in flock {flock} at step {step} is not finite "
+                f"({value[flock, agent].tolist()}); {remedy}"
             )
+
+    def compile(self, **kwargs: Any) -> FlockingEnv:
+        """Compile physics, graph and reward, also when built with ``compile=True``, and return the environment.
+
+        TorchRL's own way of compiling a whole step is slower on a CPU; its arguments have no effect.
+        """
+        if isinstance(self.physics, TorchPhysics):
+            self.physics.compile()
+        self._hear_all_pairs, self._judge = compiled(hear_all_pairs), compiled(judge)
+        return self
 
     def to(self, device: torch.device | str) -> FlockingEnv:
         """Return the environment itself when it lives on ``device`` already; the state does not move.
@@ -204,17 +324,75 @@ class FlockingEnv(EnvBase):
             )
         return self
 
+    def close(self, **kwargs: Any) -> None:
+        """End the physics engine; the environment cannot be used any more."""
+        self.physics.close()
+        super().close(**kwargs)
+
+
+def judge(
+    position: Tensor,
+    velocity: Tensor,
+    touching: Tensor,
+    sizes: Tensor,
+    exists: Tensor | None,
+    limits: tuple[float, float],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What a step has brought.
+
+    Args:
+        position: m [B, N, 3].
+        velocity: m/s [B, N, 3].
+        touching: agents that touch another, bool [B, N].
+        sizes: agents of each flock [B].
+        exists: agents that exist, bool [B, N]; default: all.
+        limits: distance from the centre of mass, m, and share of touching agents that end a flight when exceeded.
+
+    Returns:
+        state [B, N, 6], reward [B, N, 1], and whether the flight is over [B, 1].
+    """
+    max_distance, max_colliding = limits
+    colliding = touching.sum(-1) > max_colliding * sizes
+    terminated = (is_diverged(position, max_distance, exists) | colliding).unsqueeze(-1)
+    reward = flocking_reward(position, velocity, touching, exists)
+    return torch.cat((position, velocity), -1), reward, terminated
+
+
+def _checked_config(config: FlockingConfig | None, settings: dict[str, Any]) -> FlockingConfig:
+    """The configuration of an environment, from one of the two."""
+    if config is not None and settings:
+        raise InputError(f"give either a config or settings, not both: {', '.join(settings)}")
+    known = [field.name for field in dataclasses.fields(FlockingConfig)]
+    for name in settings:
+        if name not in known:
+            raise InputError(f"FlockingEnv has no setting {name}{suggestion(name, known)}")
+    config = config if config is not None else FlockingConfig(**settings)
+    check(config, "env")
+    return config
+
 
 def make_physics(
     config: FlockingConfig, num_envs: int, num_agents: int, device: torch.device, dtype: torch.dtype
 ) -> Physics:
-    """Build the engine that ``config.physics`` names for B flocks of N agents."""
-    return TorchPhysics(
-        num_envs,
-        num_agents,
-        control_frequency=config.control_frequency,
+    """Build the engine that ``config.physics`` names for B flocks of N agents.
+
+    Raises:
+        InputError: when it does not have what the configuration asks of it.
+    """
+    dynamics = Dynamics(
+        period=1 / config.control_frequency,
         substeps=config.physics_substeps,
         velocity_gain=config.velocity_gain,
-        device=device,
-        dtype=dtype,
+        linear_damping=config.linear_damping,
+        angular_damping=config.angular_damping,
+        drag=config.drag,
+        motor_lag=config.motor_lag,
+        ground=config.ground,
     )
+    if config.physics == "bullet":
+        from modgnn_rl.envs.bullet import BulletPhysics  # imports pybullet, which nothing else needs
+
+        return BulletPhysics(num_envs, num_agents, dynamics, collisions=config.collisions, device=device, dtype=dtype)
+    if config.collisions:
+        raise InputError("env.collisions=true needs env.physics=bullet; the torch physics lets agents pass each other")
+    return TorchPhysics(num_envs, num_agents, dynamics, device=device, dtype=dtype)

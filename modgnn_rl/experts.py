@@ -6,7 +6,7 @@ what a decentralised policy can see, and is the yardstick for such policies.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import torch
@@ -16,11 +16,14 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from modgnn_rl.cache import AgentCache, missing
+from modgnn_rl.compiling import compiled
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.tensors import clip_to_ball, pair_differences, squared_norm
+from modgnn_rl.graph import Graph, Pairs
+from modgnn_rl.tensors import clip_to_ball, is_transformed, pair_blocks, pair_differences, squared_norm
+from modgnn_rl.topology import Topology
 
-__all__ = ["LocalReynolds", "Reynolds", "reachable", "reynolds"]
+__all__ = ["LocalReynolds", "Reynolds", "as_matrix", "reachable", "reynolds"]
 
 SOFTENING = 1e-6  # m^2 (and m^2/s^2): keeps the rule finite when two agents meet
 
@@ -34,12 +37,15 @@ def reynolds(
     alignment: float,
     max_speed: float,
     visible: Tensor | None = None,
+    mask: Tensor | None = None,
 ) -> Tensor:
     """Reynolds flocking (the paper's equation of the expert), clipped to the action ball.
 
     With ``p = p_j - p_i``, ``v = v_j - v_i`` and ``|x| = sqrt(x . x + 1e-6)``::
 
         u_i = sum over visible j of  C_c p |p|  -  C_s p / |p|^3  +  C_a v |v|
+
+    Pairs are worked on in blocks that fit a cache, except where shapes must not depend on data.
 
     Args:
         position: m [..., N, 3].
@@ -48,20 +54,71 @@ def reynolds(
         separation: weight C_s.
         alignment: weight C_a.
         max_speed: radius of the action ball, m/s.
-        visible: entry i, j says that i sees j, bool [..., N, N]; default: everybody sees everybody.
+        visible: whom an agent sees. Entry i, j says that i sees j, bool [..., N, N]; or links, int64 [..., 2, E]: those
+            seen, and below them those that see, filled up with -1. Default: everybody.
+        mask: agents that are there, bool [..., N]; the others neither see nor are seen. Default: all. What is not seen
+            may be NaN.
 
     Returns:
         target velocity, m/s [..., N, 3].
+
+    Raises:
+        InputError: on links of agents that do not exist.
     """
-    offset, drift = pair_differences(position), pair_differences(velocity)
+    gains = (cohesion, separation, alignment)
+    *batch, agents, _ = position.shape
+    state = [value.reshape(-1, agents, 3) for value in (position, velocity)]
+    mask = None if mask is None else mask.expand(*batch, agents).reshape(-1, agents)
+    if visible is not None and visible.dtype == torch.int64:
+        force = _forces_over_links(state, Topology(visible, agents, mask=mask, form="links").everyone(), gains)
+    else:
+        seen = None if visible is None else visible.expand(*batch, agents, agents).reshape(-1, agents, agents)
+        force = _forces_of_pairs(state, seen, mask, gains)
+    return clip_to_ball(force.view(position.shape), max_speed)
+
+
+def _forces_of_pairs(
+    state: list[Tensor], visible: Tensor | None, mask: Tensor | None, gains: tuple[float, float, float]
+) -> Tensor:
+    """The sum of the rule over all pairs, or the visible ones, bool [B, N, N], of those in the mask; [B * N, 3]."""
+    everything = slice(0, state[0].shape[0]), slice(0, state[0].shape[1])
+    parts = []
+    for some, receivers in [everything] if is_transformed() else pair_blocks(state[0]):
+        seen = None if visible is None else visible[some, receivers]
+        if mask is not None:
+            there = mask[some].unsqueeze(-2) & mask[some, receivers].unsqueeze(-1)
+            seen = there if seen is None else seen & there
+        offset, drift = (pair_differences(value[some], receivers) for value in state)
+        force = _pair_forces(offset, drift, gains)
+        if seen is not None:
+            force = [torch.where(seen, component, 0.0) for component in force]
+        parts.append(torch.stack([component.sum(-1) for component in force], -1).flatten(0, 1))
+    return torch.cat(parts)
+
+
+def _forces_over_links(state: list[Tensor], links: Graph, gains: tuple[float, float, float]) -> Tensor:
+    """The sum of the rule over links; [B * N, 3]."""
+    nodes = [value.flatten(0, 1) for value in state]
+    offset, drift = (links.at_senders(node) - links.at_receivers(node) for node in nodes)
+    force = _pair_forces(offset.t().contiguous().unbind(), drift.t().contiguous().unbind(), gains)
+    return links.total(torch.stack(force, -1))
+
+
+def _pair_forces(offset: Sequence[Tensor], drift: Sequence[Tensor], gains: tuple[float, float, float]) -> list[Tensor]:
+    """The terms of the sum, by component, for pairs whose positions and velocities differ by so much, by component."""
+    cohesion, separation, alignment = gains
     square = squared_norm(offset) + SOFTENING
     distance = square.sqrt()
     pull = cohesion * distance - separation / (square * distance)
     follow = alignment * (squared_norm(drift) + SOFTENING).sqrt()
-    force = [torch.addcmul(pull * p, follow, v) for p, v in zip(offset, drift, strict=True)]
-    if visible is not None:
-        force = [torch.where(visible, component, 0.0) for component in force]
-    return clip_to_ball(torch.stack([component.sum(-1) for component in force], -1), max_speed)
+    return [torch.addcmul(pull * p, follow, v) for p, v in zip(offset, drift, strict=True)]
+
+
+def as_matrix(adjacency: Tensor, num_agents: int) -> Tensor:
+    """A graph as a bool matrix [..., N, N], from any form that `modgnn_rl.topology.Topology` reads."""
+    graph = Topology(adjacency, num_agents, form="pairs").everyone()
+    assert isinstance(graph, Pairs)
+    return graph.mask.view(*adjacency.shape[:-2], num_agents, num_agents)
 
 
 def reachable(adjacency: Tensor, hops: int) -> Tensor:
@@ -80,8 +137,10 @@ class Reynolds(TensorDictModuleBase):
         separation: weight C_s.
         alignment: weight C_a.
         max_speed: radius of the action ball, m/s.
-        observation: key of the observations (position, velocity) [..., N, 6].
+        observation: key of the states (position, velocity) [..., N, 6].
+        mask: key of the agents that are there, bool [..., N], read where there is one; nobody sees the others.
         action: key that the expert's action [..., N, 3] is written to.
+        compile: compile the rule.
     """
 
     def __init__(
@@ -92,36 +151,46 @@ class Reynolds(TensorDictModuleBase):
         max_speed: float = 0.92,
         *,
         observation: NestedKey = ("agents", "observation"),
+        mask: NestedKey = ("agents", "mask"),
         action: NestedKey = ("agents", "expert_action"),
+        compile: bool = False,
     ) -> None:
         super().__init__()
-        self.rule: dict[str, Any] = {
+        self.gains: dict[str, float] = {
             "cohesion": cohesion,
             "separation": separation,
             "alignment": alignment,
             "max_speed": max_speed,
         }
-        self.in_keys: Sequence[NestedKey] = [observation]
+        self._rule: Callable[..., Tensor] = compiled(reynolds, compile)
+        self.in_keys: Sequence[NestedKey] = [observation, mask]
         self.out_keys: Sequence[NestedKey] = [action]
 
     @classmethod
     def for_env(cls, config: FlockingConfig, **options: Any) -> Self:
-        """The expert of a flocking world, with that world's gains."""
-        gains = (config.cohesion_gain, config.separation_gain, config.alignment_gain)
-        return cls(*gains, config.max_speed, **options)
+        """The expert of a flocking world, with that world's gains; it sees the true states."""
+        return cls(**{**_gains_of(config), "observation": config.state_key, **options})
+
+    def rule(
+        self, position: Tensor, velocity: Tensor, visible: Tensor | None = None, mask: Tensor | None = None
+    ) -> Tensor:
+        """The target velocities, m/s [..., N, 3], see `reynolds`."""
+        # The number of links in a list is not known to a compiler.
+        rule = self._rule if visible is None or visible.dtype == torch.bool else reynolds
+        return rule(position, velocity, visible=visible, mask=mask, **self.gains)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the expert's action [..., N, 3]."""
-        position, velocity = tensordict[self.in_keys[0]].split(3, -1)
-        return tensordict.set(self.out_keys[0], reynolds(position, velocity, **self.rule))
+        state, mask = tensordict[self.in_keys[0]], tensordict.get(self.in_keys[1], None)
+        return tensordict.set(self.out_keys[0], self.rule(state[..., :3], state[..., 3:], mask=mask))
 
 
 class LocalReynolds(Reynolds):
     """Reynolds flocking with the eyes of a decentralised policy.
 
     At time t an agent sees the agents within ``hops`` links of the graph of t, as they and it were at t - 1; at the
-    first step of an episode it has heard of nobody and stays where it is. It keeps the last observation under
-    ``cache`` as recurrent state.
+    first step of an episode it has heard of nobody and stays where it is, and so does one that comes (back). It keeps
+    the last observation under ``cache`` as recurrent state.
 
     Args:
         cohesion: weight C_c.
@@ -130,10 +199,12 @@ class LocalReynolds(Reynolds):
         max_speed: radius of the action ball, m/s.
         hops: links over which an agent hears of others.
         observation: key of the observations (position, velocity) [..., N, 6].
-        adjacency: key of the adjacency [..., N, N].
+        adjacency: key of the adjacency [..., N, N], or of lists of links, int64 [..., 2, E].
         is_init: key of the flag that an episode begins [..., 1].
+        mask: key of the agents that are there, bool [..., N], read where there is one.
         cache: key of the last observation [..., N, 6].
         action: key that the action [..., N, 3] is written to.
+        compile: compile the rule.
 
     Raises:
         InputError: on ``hops`` below 1 or fractional.
@@ -150,29 +221,53 @@ class LocalReynolds(Reynolds):
         observation: NestedKey = ("agents", "observation"),
         adjacency: NestedKey = "adjacency",
         is_init: NestedKey = "is_init",
+        mask: NestedKey = ("agents", "mask"),
         cache: str = "last_observation",
         action: NestedKey = ("agents", "expert_action"),
+        compile: bool = False,
     ) -> None:
-        super().__init__(cohesion, separation, alignment, max_speed, observation=observation, action=action)
+        super().__init__(
+            cohesion, separation, alignment, max_speed, observation=observation, action=action, compile=compile
+        )
         if not isinstance(hops, int) or hops < 1:
             raise InputError(f"hops={hops!r} is not a number of links to hear over; expected an integer of at least 1")
         self.hops = hops
         self.cache = cache
-        self.in_keys = [observation, adjacency, is_init, cache]
+        self.in_keys = [observation, adjacency, is_init, cache, mask]
         self.out_keys = [action, ("next", cache)]
+
+    @classmethod
+    def for_env(cls, config: FlockingConfig, **options: Any) -> Self:
+        """The local rule of a flocking world, with that world's gains; it sees what a policy observes."""
+        return cls(**{**_gains_of(config), **options})
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action [..., N, 3] and the observation to remember [..., N, 6]."""
-        observation, adjacency, is_init, last = (tensordict.get(key) for key in self.in_keys)
+        observation, adjacency = (tensordict[key] for key in self.in_keys[:2])
+        is_init, last, mask = (tensordict.get(key, None) for key in self.in_keys[2:])
         last = missing(observation) if last is None else last
         if is_init is not None:
             last = torch.where(is_init.unsqueeze(-1), torch.nan, last)
         heard = ~last.isnan().any(-1)
-        visible = reachable(adjacency, self.hops) & heard.unsqueeze(-1) & heard.unsqueeze(-2)
-        position, velocity = last.split(3, -1)
-        action = reynolds(position, velocity, visible=visible, **self.rule)
+        if mask is not None:
+            heard = heard & mask
+            observation = torch.where(mask.unsqueeze(-1), observation, torch.nan)
+        visible = adjacency
+        if adjacency.dtype != torch.int64 or self.hops > 1:
+            visible = reachable(as_matrix(adjacency, observation.shape[-2]), self.hops)
+        action = self.rule(last[..., :3], last[..., 3:], visible, heard)
         return tensordict.set(self.out_keys[0], action).set(self.out_keys[1], observation)
 
     def make_tensordict_primer(self) -> AgentCache:
         """The transform that gives an environment this module's recurrent state."""
         return AgentCache(self, [self.cache], is_init=self.in_keys[2])
+
+
+def _gains_of(config: FlockingConfig) -> dict[str, Any]:
+    return {
+        "cohesion": config.cohesion_gain,
+        "separation": config.separation_gain,
+        "alignment": config.alignment_gain,
+        "max_speed": config.max_speed,
+        "compile": config.compile,
+    }

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from modgnn_rl.errors import InputError
 from modgnn_rl.spheres import smallest_enclosing_sphere
+from modgnn_rl.tensors import pair_blocks, pair_differences, squared_norm
 
 __all__ = [
     "action_error",
@@ -25,9 +26,6 @@ __all__ = [
     "separation",
     "smallest_distance",
 ]
-
-_PAIRS_IN_BLOCK = {"cpu": 2**17}  # pairs compared together; fits the cache of one core
-_PAIRS_IN_BLOCK_ELSEWHERE = 2**24
 
 
 def action_error(action: Tensor, expert_action: Tensor, controlled: Tensor) -> Tensor:
@@ -124,17 +122,22 @@ def near_collisions(position: Tensor, distance: float) -> Tensor:
     return close.reshape(position.shape[:-1]).sum(-1) // 2
 
 
-def is_diverged(position: Tensor, max_distance: float) -> Tensor:
+def is_diverged(position: Tensor, max_distance: float, exists: Tensor | None = None) -> Tensor:
     """Whether the flock has fallen apart: some agent is too far from the centre of mass, or not finite.
 
     Args:
         position: ``[*B, N, 3]``, m.
         max_distance: largest distance from the centre of mass of all agents, m.
+        exists: ``[*B, N]`` bool, the agents that count; default: all.
 
     Returns:
         ``[*B]`` bool.
     """
-    distance: Tensor = torch.linalg.vector_norm(position - position.mean(-2, keepdim=True), dim=-1)
+    if exists is not None:
+        there = exists.unsqueeze(-1)
+        centre = torch.where(there, position, 0.0).sum(-2, keepdim=True) / there.sum(-2, keepdim=True)
+        position = torch.where(there, position, centre)
+    distance = squared_norm((position - position.mean(-2, keepdim=True)).unbind(-1)).sqrt()
     return ~(distance <= max_distance).all(-1)  # written so that a NaN counts as diverged
 
 
@@ -173,14 +176,8 @@ def _squared_distances(position: Tensor) -> Iterator[Tensor]:
     A block ``[flocks, agents, N]`` holds several whole flocks, or some agents of one large flock against all; the
     blocks follow the order of ``position.flatten(0, -2)``. An agent's distance to itself is infinite.
     """
-    num_agents = position.shape[-2]
-    budget = _PAIRS_IN_BLOCK.get(position.device.type, _PAIRS_IN_BLOCK_ELSEWHERE)
-    for flocks in torch.split(position.reshape(-1, num_agents, 3), max(1, budget // num_agents**2)):
-        start = 0
-        for agents in torch.split(flocks, max(1, budget // num_agents), dim=1):
-            squared = flocks.new_zeros(len(flocks), agents.shape[1], num_agents)
-            for ours, theirs in zip(agents.unbind(-1), flocks.unbind(-1), strict=True):
-                squared += (ours[:, :, None] - theirs[:, None, :]).square()
-            squared.diagonal(start, 1, 2).fill_(torch.inf)
-            start += agents.shape[1]
-            yield squared
+    position = position.reshape(-1, *position.shape[-2:])
+    for flocks, agents in pair_blocks(position):
+        squared = squared_norm(pair_differences(position[flocks], agents))
+        squared.diagonal(agents.start, 1, 2).fill_(torch.inf)
+        yield squared

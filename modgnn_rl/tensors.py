@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -12,11 +12,15 @@ __all__ = [
     "clip_to_ball",
     "is_transformed",
     "keep_rows",
+    "pair_blocks",
     "pair_differences",
     "pair_distances",
     "squared_norm",
     "stack_padded",
 ]
+
+PAIRS_IN_BLOCK = {"cpu": 2**16}  # pairs compared together; fits the cache of one core
+PAIRS_IN_BLOCK_ELSEWHERE = 2**24
 
 
 def is_transformed() -> bool:
@@ -44,16 +48,36 @@ def clip_to_ball(vector: Tensor, radius: float) -> Tensor:
 
     Its gradient exists everywhere, also at the origin.
     """
-    norm = vector.square().sum(-1, keepdim=True).clamp(min=1e-16).sqrt()
-    return vector * (radius / norm).clamp(max=1.0)
+    norm = squared_norm(vector.unbind(-1)).clamp(min=1e-16).sqrt()
+    return vector * (radius / norm).clamp(max=1.0).unsqueeze(-1)
 
 
-def pair_differences(vector: Tensor) -> list[Tensor]:
-    """Differences of all pairs, one tensor [..., N, N] a component of [..., N, D]: entry i, j is ``x_j - x_i``.
+def pair_differences(vector: Tensor, receivers: slice | None = None) -> tuple[Tensor, ...]:
+    """Differences of pairs, one tensor [..., R, N] a component of [..., N, D]: entry i, j is ``x_j - x_i``.
 
-    Separate components keep everything that follows pointwise, several times faster on a CPU than [..., N, N, D].
+    Separate components keep everything that follows pointwise, several times faster on a CPU than [..., R, N, D].
+
+    Args:
+        vector: vectors x.
+        receivers: the R agents i; default: all.
     """
-    return [component.unsqueeze(-2) - component.unsqueeze(-1) for component in vector.unbind(-1)]
+    theirs = vector.movedim(-1, 0).contiguous()
+    ours = theirs if receivers is None else theirs[..., receivers]
+    return (theirs.unsqueeze(-2) - ours.unsqueeze(-1)).unbind()
+
+
+def pair_blocks(position: Tensor) -> Iterator[tuple[slice, slice]]:
+    """Cut all pairs of [B, N, D] into blocks that fit a cache: several whole flocks, or some agents of one against all.
+
+    Yields:
+        the flocks and the agents of each block, in the order of ``position.flatten(0, 1)``.
+    """
+    flocks, agents = position.shape[:2]
+    budget = PAIRS_IN_BLOCK.get(position.device.type, PAIRS_IN_BLOCK_ELSEWHERE)
+    whole, part = max(1, budget // max(1, agents) ** 2), max(1, budget // max(1, agents))
+    for flock in range(0, max(1, flocks), whole):  # an empty batch is one empty block
+        for agent in range(0, max(1, agents), part):
+            yield slice(flock, min(flock + whole, flocks)), slice(agent, min(agent + part, agents))
 
 
 def squared_norm(components: Sequence[Tensor]) -> Tensor:
@@ -68,5 +92,7 @@ def squared_norm(components: Sequence[Tensor]) -> Tensor:
 def pair_distances(position: Tensor) -> Tensor:
     """Distances of all pairs [..., N, 3] -> [..., N, N]; infinite on the diagonal: nobody is its own neighbour."""
     square = squared_norm(pair_differences(position))
+    if torch.compiler.is_compiling():
+        return square.masked_fill(torch.eye(square.shape[-1], dtype=torch.bool, device=square.device), torch.inf).sqrt()
     square.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
     return square.sqrt()

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.experts import LocalReynolds, Reynolds, reachable, reynolds
+from modgnn_rl.experts import LocalReynolds, Reynolds, as_matrix, reachable, reynolds
+from modgnn_rl.tensors import PAIRS_IN_BLOCK
 
 GAINS: dict[str, Any] = {"cohesion": 0.06, "separation": 0.8, "alignment": 0.02}
 FREE: dict[str, Any] = {**GAINS, "max_speed": 1e9}
@@ -137,7 +138,7 @@ def test_the_module_is_the_function_with_the_gains_of_the_world() -> None:
     data = TensorDict({"agents": {"observation": observation}}, [2])
     world = FlockingConfig(cohesion_gain=0.1, separation_gain=0.2, alignment_gain=0.3, max_speed=0.5)
     expert = Reynolds.for_env(world, action="u")
-    assert expert.in_keys == [("agents", "observation")]
+    assert expert.in_keys == [("agents", "observation"), ("agents", "mask")]
     assert expert.out_keys == ["u"]
     expected = reynolds(position, velocity, cohesion=0.1, separation=0.2, alignment=0.3, max_speed=0.5)
     assert torch.equal(expert(data)["u"], expected)
@@ -145,7 +146,94 @@ def test_the_module_is_the_function_with_the_gains_of_the_world() -> None:
     assert torch.equal(default, reynolds(position, velocity, **GAINS, max_speed=0.92))
 
 
+@given(seed=seeds, flocks=st.integers(0, 3), agents=sizes, budget=st.integers(1, 60))
+def test_blocks_change_nothing(seed: int, flocks: int, agents: int, budget: int) -> None:
+    state, visible = flock(seed, flocks, agents), random_graph(seed, flocks, agents=agents)
+    whole = [reynolds(*state, **GAINS, max_speed=0.92, visible=seen) for seen in (None, visible)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PAIRS_IN_BLOCK, "cpu", budget)
+        for seen, expected in zip((None, visible), whole, strict=True):
+            assert torch.equal(reynolds(*state, **GAINS, max_speed=0.92, visible=seen), expected)
+
+
+@pytest.mark.slow
+def test_the_rule_compiles_as_a_whole() -> None:
+    """The compiler sums in another order; what remains is rounding."""
+    position, velocity = (value.float() for value in flock(0, 4, 8))
+    fast = torch.compile(reynolds, fullgraph=True, dynamic=False)
+    choices: list[dict[str, Any]] = [
+        {},
+        {"visible": random_graph(0, 4, agents=8)},
+        {"mask": torch.arange(32).view(4, 8) % 3 > 0},
+    ]
+    for options in choices:
+        expected = reynolds(position, velocity, **GAINS, max_speed=0.92, **options)
+        torch.testing.assert_close(fast(position, velocity, **GAINS, max_speed=0.92, **options), expected)
+
+
 # What can be seen.
+
+
+def as_links(graph: Tensor, room: int) -> Tensor:
+    """Graphs [B, N, N] as lists of links in random order, with gaps [B, 2, room]."""
+    links = torch.full((len(graph), 2, room), -1)
+    for number, one in enumerate(graph):
+        receiver, sender = one.nonzero().unbind(-1)
+        place = torch.randperm(room, generator=torch.Generator().manual_seed(number))[: len(sender)]
+        links[number, 0, place], links[number, 1, place] = sender, receiver
+    return links
+
+
+@given(seed=seeds, agents=sizes)
+def test_lists_of_links_are_the_matrix(seed: int, agents: int) -> None:
+    state, graph = flock(seed, 3, agents), random_graph(seed, 3, agents=agents)
+    links = as_links(graph, agents**2 + 3)
+    assert torch.equal(as_matrix(links, agents), graph)
+    assert torch.equal(as_matrix(graph, agents), graph)
+    expected = reynolds(*state, **GAINS, max_speed=0.92, visible=graph)
+    torch.testing.assert_close(reynolds(*state, **GAINS, max_speed=0.92, visible=links), expected)
+    of_one = reynolds(state[0][0], state[1][0], **GAINS, max_speed=0.92, visible=links[0])
+    torch.testing.assert_close(of_one, expected[0])
+
+
+def test_links_of_agents_that_do_not_exist_are_refused() -> None:
+    links = torch.tensor([[[0, 3], [1, 0]]])
+    with pytest.raises(InputError, match="names agent 3"):
+        reynolds(*flock(0, 1, 3), **GAINS, max_speed=0.92, visible=links)
+
+
+@given(seed=seeds, agents=sizes, form=st.sampled_from(["all", "matrix", "links"]), junk=st.floats())
+def test_agents_that_are_not_there_neither_see_nor_are_seen(seed: int, agents: int, form: str, junk: float) -> None:
+    position, velocity = flock(seed, 2, agents)
+    mask = torch.rand(2, agents, generator=torch.Generator().manual_seed(seed)) < 0.6
+    graph = random_graph(seed, 2, agents=agents, share=0.6)
+    visible = {"all": None, "matrix": graph, "links": as_links(graph, agents**2)}[form]
+    seen = everybody(agents).expand(2, -1, -1) if form == "all" else graph
+    expected = reynolds(
+        position, velocity, **GAINS, max_speed=0.92, visible=seen & mask.unsqueeze(-1) & mask.unsqueeze(-2)
+    )
+    position[~mask], velocity[~mask] = junk, junk
+    action = reynolds(position, velocity, **GAINS, max_speed=0.92, visible=visible, mask=mask)
+    torch.testing.assert_close(action, expected)
+    assert not action[~mask].any()
+
+
+def test_the_expert_reads_the_mask_where_there_is_one() -> None:
+    position, velocity = flock(1, 1, 5)
+    observation = torch.cat((position, velocity), -1)
+    observation[0, 3:] = torch.nan
+    data = TensorDict({"agents": {"observation": observation, "mask": torch.arange(5).view(1, 5) < 3}}, [1])
+    action = Reynolds()(data)["agents", "expert_action"]
+    torch.testing.assert_close(action[:, :3], reynolds(position[:, :3], velocity[:, :3], **GAINS, max_speed=0.92))
+    assert not action[:, 3:].any()
+
+
+def test_the_expert_sees_the_truth_and_its_local_self_the_observation() -> None:
+    plain, noisy = FlockingConfig(), FlockingConfig(position_noise=0.1)
+    assert Reynolds.for_env(plain).in_keys[0] == ("agents", "observation")
+    assert Reynolds.for_env(noisy).in_keys[0] == ("agents", "state")
+    assert Reynolds.for_env(noisy, observation="o").in_keys[0] == "o"
+    assert LocalReynolds.for_env(noisy).in_keys[0] == ("agents", "observation")
 
 
 def hears_of(graph: Tensor, hops: int) -> Tensor:
@@ -232,6 +320,39 @@ def test_an_agent_of_which_nothing_is_stored_is_not_seen() -> None:
     assert not action[2].any()
 
 
+@given(seed=seeds, agents=sizes, hops=st.integers(1, 3))
+def test_local_reynolds_reads_lists_of_links(seed: int, agents: int, hops: int) -> None:
+    yesterday, today = (torch.cat(flock(seed + n, 2, agents), -1) for n in (0, 1))
+    yesterday[0, 0] = torch.nan
+    graph, key = random_graph(seed, 2, agents=agents), ("agents", "expert_action")
+    expert = LocalReynolds(hops=hops)
+    expected = expert(step(today, graph, yesterday))[key]
+    torch.testing.assert_close(expert(step(today, as_links(graph, agents**2), yesterday))[key], expected)
+
+
+@pytest.mark.parametrize("form", ["matrix", "links"])
+def test_one_that_comes_back_begins_with_nothing(form: str) -> None:
+    """Agent 2 is away at the second of four steps; what it observes then is worth nothing."""
+    states = [torch.cat(flock(n, 1, 4), -1) for n in range(4)]
+    states[1][0, 2] = torch.nan
+    graph = everybody(4).unsqueeze(0)
+    adjacency = graph if form == "matrix" else as_links(graph, 16)
+    expert, last, actions = LocalReynolds(), None, []
+    for number, state in enumerate(states):
+        data = step(state, adjacency, last)
+        data["agents", "mask"] = torch.tensor([[True, True, number != 1, True]])
+        out = expert(data)
+        last = out["next", "last_observation"]
+        actions.append(out["agents", "expert_action"])
+    assert not actions[0].any()
+    rest = [0, 1, 3]
+    for number in (1, 2):  # away, and back without a memory: neither heard of nor moving
+        position, velocity = states[number - 1][:, rest].split(3, -1)
+        torch.testing.assert_close(actions[number][:, rest], reynolds(position, velocity, **GAINS, max_speed=0.92))
+        assert not actions[number][:, 2].any()
+    torch.testing.assert_close(actions[3], reynolds(*states[2].split(3, -1), **GAINS, max_speed=0.92))
+
+
 @pytest.mark.parametrize("hops", [0, -1, 1.5])
 def test_local_reynolds_needs_a_hop(hops: int) -> None:
     with pytest.raises(InputError, match="hops="):
@@ -239,6 +360,6 @@ def test_local_reynolds_needs_a_hop(hops: int) -> None:
 
 
 def test_keys_of_local_reynolds_can_be_renamed() -> None:
-    expert = LocalReynolds(observation="o", adjacency="g", is_init="b", cache="c", action="u")
-    assert expert.in_keys == ["o", "g", "b", "c"]
+    expert = LocalReynolds(observation="o", adjacency="g", is_init="b", cache="c", mask="m", action="u")
+    assert expert.in_keys == ["o", "g", "b", "c", "m"]
     assert expert.out_keys == ["u", ("next", "c")]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from modgnn_rl import metrics
+from modgnn_rl import metrics, tensors
 from modgnn_rl.errors import InputError
 
 NAN, INF = math.nan, math.inf
@@ -73,7 +73,7 @@ def test_closed_form_line() -> None:
 def test_pairs_match_loops_whatever_the_blocks(
     monkeypatch: pytest.MonkeyPatch, budget: int, dtype: torch.dtype
 ) -> None:
-    monkeypatch.setitem(metrics._PAIRS_IN_BLOCK, "cpu", budget)
+    monkeypatch.setitem(tensors.PAIRS_IN_BLOCK, "cpu", budget)
     position = random_flocks(2, 3, 9).to(dtype)
     separation, count = metrics.separation(position), metrics.near_collisions(position, 1.0)
     assert separation.dtype == dtype
@@ -172,6 +172,19 @@ def test_not_finite_flocks_are_diverged(bad: float) -> None:
     assert metrics.near_collisions(position, 1.0).tolist() == [6, 3]
     assert metrics.is_lost(position, 1.0).tolist() == [False, False]
     assert metrics.is_lost(position, 1.0, leader=2).tolist() == [False, True]
+
+
+def test_agents_that_do_not_exist_make_no_flock_diverge() -> None:
+    position = torch.zeros(3, 5, 3)
+    position[:, :3] = torch.tensor([[0.0, 0, 0], [3, 0, 0], [6, 0, 0]])
+    position[0, 3:], position[1, 3:], position[2, 3:] = NAN, INF, 1e4
+    exists = torch.arange(5).expand(3, 5) < 3
+    for distance in (2.9, 3.0, 3.1):
+        expected = metrics.is_diverged(position[:, :3], distance)
+        assert torch.equal(metrics.is_diverged(position, distance, exists), expected)
+    assert metrics.is_diverged(position, 3.1).all()
+    position[1, 2, 0] = NAN
+    assert metrics.is_diverged(position, 3.1, exists).tolist() == [False, True, False]
 
 
 def test_nan_agent_shows_in_the_separation_of_its_flock_only() -> None:

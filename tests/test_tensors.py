@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from modgnn_rl.tensors import clip_to_ball, pair_differences, pair_distances, squared_norm
+from modgnn_rl import tensors
+from modgnn_rl.tensors import clip_to_ball, pair_blocks, pair_differences, pair_distances, squared_norm
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -54,6 +55,24 @@ def test_differences_point_from_row_to_column() -> None:
         for i in range(5):
             for j in range(5):
                 assert torch.equal(difference[:, i, j], x[:, j, component] - x[:, i, component])
+
+
+def test_differences_to_some_receivers_are_rows_of_those_to_all() -> None:
+    x = random(2, 5, 3)
+    for some, everyone in zip(pair_differences(x, slice(1, 4)), pair_differences(x), strict=True):
+        assert torch.equal(some, everyone[:, 1:4])
+
+
+@given(st.integers(0, 5), st.integers(0, 9), st.integers(1, 120))
+def test_blocks_hold_every_receiver_once_in_order_and_no_more_pairs_than_fit(
+    flocks: int, agents: int, budget: int
+) -> None:
+    numbers = torch.arange(flocks * agents).view(flocks, agents, 1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(tensors.PAIRS_IN_BLOCK, "cpu", budget)
+        blocks = [numbers[some, receivers] for some, receivers in pair_blocks(numbers)]
+    assert torch.equal(torch.cat([block.flatten() for block in blocks]), numbers.flatten())
+    assert all(block.numel() * agents <= max(budget, agents) for block in blocks)
 
 
 def test_squared_norm_sums_the_squares() -> None:
