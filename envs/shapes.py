@@ -1,0 +1,86 @@
+"""Triangle meshes of what is drawn of a flock, as arrays [T, 3, 3]: triangles, their corners, coordinates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["ARROW", "QUADCOPTER", "along", "copies", "normals", "rotations"]
+
+Array = NDArray[Any]
+
+
+def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Array:
+    """A box between two corners."""
+    corners = np.array([[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])
+    faces = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    return corners[[triangle for a, b, c, d in faces for triangle in ((a, b, c), (a, c, d))]]
+
+
+def _ring(radius: float, height: float, sides: int) -> Array:
+    """Points of a regular polygon about the z axis [sides, 3]."""
+    angle = np.arange(sides) * 2 * np.pi / sides
+    return np.stack((radius * np.cos(angle), radius * np.sin(angle), np.full(sides, height)), -1)
+
+
+def _cone(radius: float, bottom: float, top: float, sides: int) -> Array:
+    """A cone about the z axis, with its base."""
+    ring = _ring(radius, bottom, sides)
+    following = np.roll(ring, -1, 0)
+    tip, centre = (np.broadcast_to((0.0, 0.0, height), ring.shape) for height in (top, bottom))
+    return np.concatenate((np.stack((ring, following, tip), 1), np.stack((following, ring, centre), 1)))
+
+
+def _tube(radius: float, bottom: float, top: float, sides: int) -> Array:
+    """The side of a cylinder about the z axis."""
+    low, high = _ring(radius, bottom, sides), _ring(radius, top, sides)
+    low_next, high_next = np.roll(low, -1, 0), np.roll(high, -1, 0)
+    return np.concatenate((np.stack((low, low_next, high_next), 1), np.stack((low, high_next, high), 1)))
+
+
+def _quadcopter() -> Array:
+    """Two crossed bars and four rotors, the arms being 1 long."""
+    diagonal = rotations(np.array([[0, 0, np.sin(np.pi / 8), np.cos(np.pi / 8)]]))[0]
+    bars = np.concatenate((_box((-1, -0.1, -0.08), (1, 0.1, 0.08)), _box((-0.1, -1, -0.08), (0.1, 1, 0.08))))
+    rotor = np.concatenate((_cone(0.55, 0.14, 0.2, 10), _cone(0.55, 0.14, 0.08, 10)[:, ::-1]))
+    rotors = [rotor + np.array((x, y, 0)) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+    return np.concatenate((bars, *rotors)) @ diagonal.T
+
+
+def normals(mesh: Array) -> Array:
+    """The normal of its triangle for each corner [T, 3, 3]."""
+    normal = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.repeat((normal / np.maximum(length, 1e-30))[:, None], 3, 1)
+
+
+def copies(mesh: Array, transforms: Array, positions: Array) -> Array:
+    """Copies of a mesh, each transformed by a matrix [K, 3, 3] and put at a position [K, 3], as one mesh."""
+    return (np.einsum("kij,tcj->ktci", transforms, mesh) + positions[:, None, None]).reshape(-1, 3, 3)
+
+
+def along(vectors: Array, width: float) -> Array:
+    """Matrices [K, 3, 3] that take the z axis to vectors [K, 3], and the axes beside it to what is ``width`` long."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    axis = np.where(length > 0, vectors / np.maximum(length, 1e-30), (0.0, 0.0, 1.0))
+    helper = np.where(np.abs(axis[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    side = np.cross(helper, axis)
+    side /= np.linalg.norm(side, axis=-1, keepdims=True)
+    return np.stack((width * side, width * np.cross(axis, side), vectors), -1)
+
+
+def rotations(quaternions: Array) -> Array:
+    """Rotation matrices [K, 3, 3] of unit quaternions x, y, z, w [K, 4]."""
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+QUADCOPTER = _quadcopter()
+ARROW = np.concatenate((_tube(1.0, 0.0, 0.75, 8), _cone(2.4, 0.72, 1.0, 8)))  # along z, 1 long

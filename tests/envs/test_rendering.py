@@ -1,0 +1,115 @@
+"""Pictures: everything that is drawn is there, in its colour, and stays in view."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+from modgnn_rl.envs.rendering import Flock, Renderer, check_render_mode
+from modgnn_rl.envs.shapes import ARROW, along, copies, normals, rotations
+from modgnn_rl.errors import InputError
+
+LEVEL = [0.0, 0.0, 0.0, 1.0]
+
+
+def flock(position: list[list[float]], *, speed: float = 0.0, linked: bool = False) -> Flock:
+    count = len(position)
+    return Flock(
+        np.array(position, float).reshape(-1, 3),
+        np.tile(LEVEL, (count, 1)),
+        np.tile([speed, 0.0, 0.0], (count, 1)),
+        np.full((count, count), linked) & ~np.eye(count, dtype=bool),
+    )
+
+
+def draw(what: Flock) -> np.ndarray:
+    renderer = Renderer(width=160, height=120)
+    image = renderer.draw(what)
+    renderer.close()
+    assert image is not None
+    assert image.dtype == np.uint8
+    assert image.shape == (120, 160, 3)
+    return image.astype(int)
+
+
+def shares(image: np.ndarray) -> tuple[float, float, float, float]:
+    """Shares of the picture that are red, blue, yellow and dark."""
+    red, green, blue = np.moveaxis(image, -1, 0)
+    return (
+        float(((red > 130) & (green < 140) & (blue < 140)).mean()),
+        float(((blue > 120) & (red < 0.75 * blue)).mean()),
+        float(((red > 180) & (blue < 0.85 * red)).mean()),
+        float(((image.sum(-1) < 480) & (image.max(-1) - image.min(-1) < 40)).mean()),
+    )
+
+
+CORNERS = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
+
+
+def test_each_thing_has_its_colour() -> None:
+    bare, arrows, links = (
+        shares(draw(flock(CORNERS))),
+        shares(draw(flock(CORNERS, speed=0.9))),
+        shares(draw(flock(CORNERS, linked=True))),
+    )
+    assert bare[0] > 0.001  # the leader
+    assert bare[3] > 0.0005  # the others
+    assert arrows[1] > bare[1] + 0.005
+    assert links[2] > bare[2] + 0.003
+
+
+def test_the_camera_follows_the_flock_and_fits_its_size() -> None:
+    image = draw(flock(CORNERS, linked=True))
+    far = [[x + 1000.0, y - 500.0, z + 20.0] for x, y, z in CORNERS]
+    assert np.abs(draw(flock(far, linked=True)) - image).mean() < 1.0
+    wide = shares(draw(flock([[20 * c for c in corner] for corner in CORNERS])))
+    assert wide[3] > 0.0002  # agents are drawn large enough to see
+
+
+def test_agents_without_a_position_are_left_out() -> None:
+    image = draw(flock([*CORNERS, [np.nan, 0, 0]], linked=True))
+    assert np.array_equal(image, draw(flock(CORNERS, linked=True)))
+    draw(flock([[np.nan] * 3]))
+    draw(flock([[1.0, 2.0, 3.0]]))
+
+
+def test_pictures_come_from_gymnasium() -> None:
+    env = gymnasium.make("modgnn_rl/Flocking-v0", num_agents=40, render_mode="rgb_array", width=160, height=120)
+    env.reset(seed=0)
+    image = env.render()
+    assert isinstance(image, np.ndarray)
+    assert image.std() > 5
+    env.close()
+
+
+@pytest.mark.parametrize("variable", ["DISPLAY", "WAYLAND_DISPLAY"])
+def test_a_window_needs_a_display(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match="needs a display and there is none"):
+        Renderer("human")
+    monkeypatch.setenv(variable, ":0")
+    check_render_mode("human")
+
+
+def test_what_cannot_be_drawn_is_refused() -> None:
+    with pytest.raises(InputError, match="'ansi' is not one of human, rgb_array"):
+        Renderer("ansi")
+    with pytest.raises(InputError, match="width=0"):
+        Renderer(width=0)
+    renderer = Renderer(width=32, height=32)
+    renderer.close()
+    with pytest.raises(InputError, match="has been closed"):
+        renderer.draw(flock(CORNERS))
+
+
+def test_meshes_are_moved_as_asked() -> None:
+    vectors = np.array([[0.0, 0.0, 2.0], [1.0, 2.0, -2.0], [0.0, 0.0, 0.0]])
+    placed = copies(ARROW, along(vectors, 0.1), np.ones((3, 3))).reshape(3, -1, 3)
+    tip = ARROW.reshape(-1, 3)[:, 2].argmax()
+    assert np.allclose(placed[:, tip], 1 + vectors)
+    assert np.allclose(np.linalg.norm(normals(ARROW), axis=-1), 1)
+    quarter = rotations(np.array([[0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4)]]))[0]
+    assert np.allclose(quarter @ [1, 0, 0], [0, 1, 0])
