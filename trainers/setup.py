@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from modgnn_rl.configs.schema import ImitationConfig, TrainConfig
+from modgnn_rl.configs.schema import BCConfig, ImitationConfig, TrainConfig
+from modgnn_rl.dataset import FlightDataset
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.models import configured_model
@@ -28,7 +29,7 @@ def check_training(config: TrainConfig) -> None:
 
     Raises:
         InputError: sizes that repeat or hold no agent to train, too few updates for the sizes, a model with nothing to
-            learn, or agents that do not fit into the ball they start in.
+            learn, agents that do not fit into the ball they start in, or a dataset that is damaged or does not fit.
     """
     settings: ImitationConfig = config.trainer
     sizes = config.env.sizes
@@ -44,3 +45,11 @@ def check_training(config: TrainConfig) -> None:
         raise InputError(f"model.name={config.model.name} with model.hops={config.model.hops} has nothing to learn")
     for size in sizes:
         FlockingEnv(1, size, config=config.env, seed=config.seed).reset()
+    if isinstance(settings, BCConfig) and settings.dataset:
+        dataset = FlightDataset.open(settings.dataset)
+        dataset.check_world(config.env)
+        if dataset.episodes <= settings.held_out:
+            raise InputError(
+                f"trainer.held_out={settings.held_out} leaves nothing to train on of the {dataset.episodes} episodes "
+                f"in {settings.dataset}; lower it, or collect more"
+            )

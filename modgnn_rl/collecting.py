@@ -1,0 +1,243 @@
+"""Writing the expert's flights to a dataset, shard by shard, so that a stopped collection can go on."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import json
+import math
+import os
+import re
+import shlex
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
+from modgnn_rl.dataset import WITHOUT_EFFECT
+from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.errors import InputError
+from modgnn_rl.experts import Reynolds
+from modgnn_rl.files import fsync_file, fsync_folder
+from modgnn_rl.manifest import FILES, Manifest, check_shard, describe_files, num_bytes
+from modgnn_rl.progress import Progress
+from modgnn_rl.seeds import derive_seed
+from modgnn_rl.settings import check
+from modgnn_rl.training import prepare_torch
+
+__all__ = ["collect", "fly_expert", "report"]
+
+MARGIN = 2**24  # bytes that stay free on the disk
+LEFTOVER = re.compile(r"shard_\d{5,}\.tmp|\.manifest\.json\.\d+\.tmp")  # of a process that was killed
+# Faults that are seen only through adjacency, observation and mask, which a dataset does not hold.
+UNSEEN = ("message_loss", "delay", "range_spread", "position_noise", "velocity_noise", "dropout_rate")
+
+
+def collect(config: CollectConfig) -> Path:
+    """Fly the expert and write a dataset, or what is missing of it; see `modgnn_rl.manifest` for its files.
+
+    Each shard has a seed of its own and is written whole or not at all: whatever interrupts a collection, the same
+    settings later lead to the same dataset, bit for bit on the same machine.
+
+    Returns:
+        the folder.
+
+    Raises:
+        InputError: a bad setting, a folder that cannot be written to or holds other things, or too little space.
+    """
+    check(config)
+    prepare_torch(config.device, config.threads)
+    wanted = Manifest(
+        world=_recordable(config.env, config.steps or config.env.max_steps),
+        seed=config.seed,
+        num_envs=config.num_envs,
+        steps=config.steps or config.env.max_steps,
+        device=config.device,
+        episodes=config.episodes,
+    )
+    folder = Path(config.output or f"datasets/{wanted.num_agents}-agents")
+    try:
+        wanted.shards = _kept_shards(folder, wanted)
+        missing = {name: shape for name, shape in wanted.shapes.items() if name not in wanted.shards}
+        _check_space(folder, sum(map(num_bytes, missing.values())))
+        if missing:
+            _fly_shards(folder, wanted, missing)
+    except OSError as error:
+        raise InputError(
+            f"cannot write into {folder} ({error.strerror}): give output=<a folder that you can write to>"
+        ) from error
+    return folder
+
+
+def _recordable(world: FlockingConfig, steps: int) -> FlockingConfig:
+    """The world of a dataset of flights of so many steps.
+
+    Raises:
+        InputError: a flock cannot be known from positions and velocities in this world.
+    """
+    if len(world.sizes) > 1:
+        raise InputError(f"env.num_agents={world.sizes} are several sizes; a dataset has one, collect one for each")
+    hidden = [f"env.{name}={getattr(world, name)}" for name in UNSEEN if getattr(world, name)]
+    if world.graph != "matrix":
+        hidden.append(f"env.graph={world.graph}")
+    if hidden:
+        raise InputError(
+            f"a dataset holds positions and velocities, which do not tell what agents see with {', '.join(hidden)}; "
+            "leave it out, or train with trainer=dagger, which collects its own flights"
+        )
+    return dataclasses.replace(world, num_agents=world.sizes[0], max_steps=steps)
+
+
+def _kept_shards(folder: Path, wanted: Manifest) -> dict[str, dict[str, Any]]:
+    """The entries of the shards that the folder holds already, whole.
+
+    Raises:
+        InputError: the folder holds other things, or a dataset of other settings or more episodes.
+    """
+    if not folder.exists() or all(map(LEFTOVER.fullmatch, os.listdir(folder))):
+        return {}
+    found = Manifest.read(folder)
+    if different := found.differences(wanted.settings):
+        raise InputError(f"{folder} holds flights with other settings: {different}; give output=<another folder>")
+    if found.episodes > wanted.episodes:
+        raise InputError(
+            f"{folder} is for {found.episodes} episodes, more than episodes={wanted.episodes}; give at least as many, "
+            "or output=<another folder>"
+        )
+    kept = {}
+    for name in found.shards.keys() & wanted.shapes.keys():
+        # A last shard that was shorter than the others is flown again with all episodes when more are wanted.
+        if found.shapes[name] == wanted.shapes[name]:
+            try:
+                check_shard(folder / name, found.shards[name], wanted.shapes[name], verify=True)
+                kept[name] = found.shards[name]
+            except ValueError as error:
+                print(f"{folder / name} is damaged ({error}) and is flown again", file=sys.stderr)
+    return kept
+
+
+def _check_space(folder: Path, size: int) -> None:
+    """Refuse to begin what the disk has no room for.
+
+    Raises:
+        InputError: with the space needed and the space free.
+    """
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(there).free
+    if size and free < size + MARGIN:
+        raise InputError(
+            f"the flights take {size / 1e6:,.0f} MB and the disk of {folder} has {free / 1e6:,.0f} MB free; make room, "
+            "lower episodes or steps, or give output=<folder on another disk>"
+        )
+
+
+def _fly_shards(folder: Path, manifest: Manifest, missing: dict[str, tuple[int, int, int, int]]) -> None:
+    """Fly the missing shards, by name their shapes, and note each in the manifest when it is safe on the disk."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with _locked(folder), Progress("collect", sum(shape[0] * shape[1] for shape in missing.values())) as progress:
+        for name in filter(LEFTOVER.fullmatch, os.listdir(folder)):
+            path = folder / name
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        manifest.write(folder)
+        env = None
+        try:
+            for name, (episodes, steps, agents, _) in missing.items():
+                if env is None or env.batch_size[0] != episodes:
+                    env = FlockingEnv(episodes, agents, config=manifest.world, device=manifest.device)
+                env.set_seed(derive_seed(manifest.seed, name))
+                states = fly_expert(env, steps, progress)
+                _check_space(folder, num_bytes(states.shape))
+                _write_shard(folder / name, states)
+                manifest.shards[name] = describe_files(folder / name)
+                manifest.write(folder)
+                progress.update(shards=f"{len(manifest.shards)}/{len(manifest.shapes)}")
+        except KeyboardInterrupt:
+            print(
+                f"Stopped; {folder} has {len(manifest.shards)} of {len(manifest.shapes)} shards, and the same command "
+                "goes on from there",
+                file=sys.stderr,
+            )
+            raise
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing a dataset; the system ends this with the process, however that ends.
+
+    Raises:
+        InputError: another process is writing it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError as error:
+        raise InputError(f"another process is writing into {folder}; wait for it, or end it first") from error
+    finally:
+        os.close(descriptor)
+
+
+@torch.no_grad()
+def fly_expert(env: FlockingEnv, steps: int, progress: Progress | None = None) -> Tensor:
+    """Fly the expert from fresh starts; nothing ends a flight early.
+
+    Args:
+        env: B flocks of N agents; their generators decide the flights.
+        steps: steps T.
+        progress: counts flock-steps.
+
+    Returns:
+        positions, m, and velocities, m/s, before each step, on the CPU [B, T, N, 6].
+    """
+    expert = Reynolds.for_env(env.config, action=("agents", "action"))
+    states = torch.empty(env.batch_size[0], steps, env.num_agents, 6, dtype=env.dtype, device=env.device)
+    tensordict = env.reset()
+    for step in range(steps):
+        states[:, step] = tensordict["agents", "observation"]
+        # A plain loop: only a reset, which does not happen here, would end a flight.
+        tensordict = env.step_mdp(env.step(expert(tensordict)))
+        if progress is not None:
+            progress.update(len(states))
+    return states.cpu()
+
+
+def _write_shard(path: Path, states: Tensor) -> None:
+    """Write states [E, T, N, 6] as a memory-mapped TensorDict, whole or not at all."""
+    temporary = path.with_name(path.name + ".tmp")
+    TensorDict({"state": states}, states.shape[:2]).memmap(temporary)
+    for file in FILES:
+        fsync_file(temporary / file)
+    fsync_folder(temporary)
+    if path.exists():  # damaged, or too short
+        shutil.rmtree(path)
+    os.replace(temporary, path)
+    fsync_folder(path.parent)
+
+
+def report(folder: Path) -> str:
+    """Where a dataset is, its size, and the command that trains on it."""
+    manifest = Manifest.read(folder)
+    size = sum(map(num_bytes, manifest.shapes.values()))
+    default = {f"env.{name}": value for name, value in vars(FlockingConfig()).items() if name not in WITHOUT_EFFECT}
+    changed = [
+        f"{name}={_as_override(manifest.settings[name])}"
+        for name in default
+        if manifest.settings[name] != default[name]
+    ]
+    command = shlex.join(["python", "-m", "modgnn_rl.train", "trainer=bc", f"trainer.dataset={folder}", *changed])
+    return (
+        f"{manifest.episodes} flights of {manifest.steps} steps with {manifest.num_agents} agents are in {folder} "
+        f"({size / 1e6:,.1f} MB)\nNext: {command}"
+    )
+
+
+def _as_override(value: Any) -> str:
+    """A value as the command line writes it."""
+    return value if isinstance(value, str) else "inf" if value == math.inf else json.dumps(value)

@@ -1,0 +1,237 @@
+"""The expert's flights from a folder that ``python -m modgnn_rl.collect`` made.
+
+Example::
+
+    dataset = FlightDataset.open("datasets/32-agents")
+    buffer = dataset.buffer(length=2, batch_size=256, generator=torch.Generator().manual_seed(0))
+    batch = buffer.sample()  # windows [256, 2] with the keys of FlockingEnv and the expert's actions
+
+Only positions and velocities are stored: graphs and the expert's actions are functions of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
+from torchrl.data.replay_buffers import Storage
+
+from modgnn_rl.configs.schema import FlockingConfig, as_list
+from modgnn_rl.errors import InputError
+from modgnn_rl.experts import Reynolds
+from modgnn_rl.manifest import MANIFEST, STATE, Manifest, check_shard
+from modgnn_rl.tensors import pair_distances
+
+__all__ = ["WITHOUT_EFFECT", "FlightDataset", "FlightWindows"]
+
+# Settings of a world that neither flights, nor graphs as matrices, nor the expert's actions depend on.
+WITHOUT_EFFECT = ("max_steps", "max_links", "compile", "max_distance", "collision_distance", "max_colliding")
+
+
+class FlightDataset:
+    """Flights of flocks of one size in one world; open it with `open`.
+
+    Attributes:
+        path: the folder.
+        manifest: its manifest.
+        world: the world of the flights.
+        episodes: number of flights, E.
+        steps: steps of each, T.
+        num_agents: agents in each, N.
+        shards: the flights, memory-mapped TensorDicts [E_k, T] that hold "state" [E_k, T, N, 6]: positions, m, and
+            velocities, m/s. Changes of them stay in this process.
+        device: where `windows` puts its result.
+    """
+
+    def __init__(self, path: Path, manifest: Manifest, shards: list[TensorDict], device: torch.device | str) -> None:
+        self.path, self.manifest, self.shards = path, manifest, shards
+        self.world: FlockingConfig = manifest.world
+        self.episodes, self.steps, self.num_agents = manifest.episodes, manifest.steps, manifest.num_agents
+        self.device = torch.device(device)
+        self._expert = Reynolds.for_env(dataclasses.replace(self.world, compile=False))
+
+    @classmethod
+    def open(
+        cls, path: str | os.PathLike[str], *, verify: bool = True, device: torch.device | str = "cpu"
+    ) -> FlightDataset:
+        """Open a complete and undamaged dataset; nothing is loaded that could run code.
+
+        Args:
+            path: its folder.
+            verify: compare the hashes of all files; one to three seconds for a gigabyte. Names and sizes always are.
+            device: where `windows` puts its result.
+
+        Raises:
+            InputError: it is no dataset, of another version, not complete, or damaged, or a file does not belong there.
+        """
+        path = Path(path)
+        manifest = Manifest.read(path)
+        if not manifest.is_complete:
+            raise InputError(
+                f"{path} is not complete, it has {len(manifest.shards)} of {len(manifest.shapes)} shards; run the same "
+                "python -m modgnn_rl.collect again to complete it"
+            )
+        if foreign := sorted(set(os.listdir(path)) - {MANIFEST, *manifest.shapes}):
+            raise InputError(f"{path / foreign[0]} does not belong to the dataset: move it elsewhere")
+        shards = []
+        for name, shape in manifest.shapes.items():
+            try:
+                check_shard(path / name, manifest.shards[name], shape, verify=verify)
+                # A private mapping: who changes what it shows does not change the file.
+                state = torch.from_file(str(path / name / STATE), shared=False, size=math.prod(shape))
+            except (OSError, ValueError, RuntimeError) as error:
+                raise InputError(
+                    f"{path / name} is damaged ({error}): restore it, or run the same python -m modgnn_rl.collect again"
+                ) from error
+            shards.append(TensorDict({"state": state.view(shape)}, shape[:2]))
+        return cls(path, manifest, shards, device)
+
+    def check_world(self, world: FlockingConfig) -> None:
+        """Refuse to serve another world than the one of the flights.
+
+        Raises:
+            InputError: with the settings that differ.
+        """
+        wanted = {name: value for name, value in vars(world).items() if name not in WITHOUT_EFFECT}
+        size = as_list(wanted["num_agents"])
+        wanted["num_agents"] = size[0] if len(size) == 1 else size
+        different = self.manifest.differences({f"env.{name}": value for name, value in wanted.items()})
+        if different:
+            raise InputError(
+                f"the flights in {self.path} are of another world than env: {different}; set these as they are there, "
+                "or collect flights of this world"
+            )
+
+    def __len__(self) -> int:
+        """Number of flock states, E T; state t of flight e has the index e T + t."""
+        return self.episodes * self.steps
+
+    def states(self, index: Tensor, length: int) -> Tensor:
+        """Positions and velocities of the ``length`` steps up to each index, on the CPU.
+
+        Steps before the start of a flight show its first state.
+
+        Args:
+            index: indices of flock states, int64 [S].
+            length: steps W of each window.
+
+        Returns:
+            states [S, W, N, 6].
+
+        Raises:
+            InputError: for an index that does not exist, or a length below 1.
+        """
+        index = index.cpu()
+        if length < 1 or (len(index) and not 0 <= int(index.min()) <= int(index.max()) < len(self)):
+            raise InputError(
+                f"windows of length {length} at indices {index.tolist()[:3]}... do not exist; lengths begin at 1, and "
+                f"indices are 0 to {len(self) - 1}"
+            )
+        episode, step = index // self.steps, self._steps(index, length).clamp(min=0)
+        shard, row = episode // self.manifest.num_envs, (episode % self.manifest.num_envs).unsqueeze(-1)
+        states = torch.empty(*step.shape, self.num_agents, 6)
+        for number in shard.unique().tolist():
+            chosen = shard == number
+            states[chosen] = self.shards[number]["state"][row[chosen], step[chosen]]
+        return states
+
+    def windows(self, index: Tensor, length: int) -> TensorDict:
+        """Windows of flights as `FlockingEnv` shows them, with the expert's actions.
+
+        A window that begins before its flight repeats the first state, and says each time that an episode begins
+        there, so that a policy has heard of nobody; a window of ``policy.window`` steps has exact actions at its end.
+
+        Args:
+            index: index of the last state of each window, int64 [S], see ``len``.
+            length: steps W of each window.
+
+        Returns:
+            [S, W], with ``("agents", "observation")`` [S, W, N, 6], ``("agents", "controlled")`` [S, W, N],
+            ``("agents", "expert_action")`` [S, W, N, 3], ``adjacency`` [S, W, N, N] and ``is_init`` [S, W, 1].
+        """
+        states = self.states(index, length).to(self.device)
+        is_init = (self._steps(index, length) <= 0).unsqueeze(-1).to(self.device)
+        controlled = torch.ones(states.shape[:-1], dtype=torch.bool, device=self.device)
+        controlled[..., 0] = False
+        agents = TensorDict({"observation": states, "controlled": controlled}, states.shape[:2])
+        adjacency = pair_distances(states[..., :3]) <= self.world.comm_range
+        windows = TensorDict({"agents": agents, "adjacency": adjacency, "is_init": is_init}, states.shape[:2])
+        return self._expert(windows)
+
+    def _steps(self, index: Tensor, length: int) -> Tensor:
+        """The steps that windows show, [S, W]; those before the start of the flight are negative."""
+        return (index % self.steps).unsqueeze(-1) + torch.arange(1 - length, 1, device=index.device)
+
+    def buffer(
+        self,
+        length: int,
+        batch_size: int,
+        *,
+        episodes: range | None = None,
+        generator: torch.Generator | None = None,
+    ) -> ReplayBuffer:
+        """A TorchRL replay buffer whose batches are windows with random ends, drawn with replacement.
+
+        Args:
+            length: steps of each window.
+            batch_size: windows in a batch.
+            episodes: flights to draw from, without gaps; default: all.
+            generator: source of randomness; default: torch's own.
+        """
+        return ReplayBuffer(
+            storage=FlightWindows(self, length, range(self.episodes) if episodes is None else episodes, generator),
+            sampler=RandomSampler(),
+            writer=ImmutableDatasetWriter(),
+            collate_fn=_as_it_is,  # a batch is made whole
+            batch_size=batch_size,
+            generator=generator,
+        )
+
+
+class FlightWindows(Storage):
+    """Some flights of a dataset as a storage for TorchRL's replay buffers; item i is the window that ends at state i.
+
+    TorchRL's ``TensorStorage`` over the mapped states would serve single states. Windows reach over several of them,
+    back to the start of the flight and no further, and graphs and labels are made for the states of a batch only:
+    stored they would take 50 times the space.
+
+    Args:
+        dataset: the flights.
+        length: steps of each window.
+        episodes: the flights to serve, without gaps.
+        generator: draws the indices.
+
+    Raises:
+        InputError: the dataset does not have these flights.
+    """
+
+    def __init__(
+        self, dataset: FlightDataset, length: int, episodes: range, generator: torch.Generator | None = None
+    ) -> None:
+        if not 0 <= episodes.start < episodes.stop <= dataset.episodes or episodes.step != 1:
+            raise InputError(f"{episodes} are not some of the {dataset.episodes} episodes of {dataset.path}")
+        # Not compilable ones would share a counter between processes, and start one of their own for that.
+        super().__init__(len(episodes) * dataset.steps, compilable=True)
+        self.dataset, self.length, self.episodes = dataset, length, episodes
+        self.device = None if generator is None else generator.device
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return self.max_size
+
+    def get(self, index: Any) -> TensorDictBase:
+        """The windows [S, W] that end at these states [S] of the flights, or the one [W] that ends at one state."""
+        index = torch.as_tensor(index)
+        windows = self.dataset.windows(index.view(-1) + self.episodes.start * self.dataset.steps, self.length)
+        return windows if index.ndim else windows[0]
+
+
+def _as_it_is(batch: TensorDictBase) -> TensorDictBase:
+    return batch

@@ -1,0 +1,119 @@
+"""Behaviour cloning on a dataset: never on the held-out flights, and never on a dataset that does not fit."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from modgnn_rl import make_model, training
+from modgnn_rl.checkpoint import load_checkpoint
+from modgnn_rl.collecting import collect
+from modgnn_rl.configs.schema import (
+    BCConfig,
+    CollectConfig,
+    FlockingConfig,
+    ModelConfig,
+    TrainConfig,
+)
+from modgnn_rl.dataset import FlightDataset, FlightWindows
+from modgnn_rl.errors import InputError
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.trainers.learner import Learner
+from modgnn_rl.training import train
+
+WORLD = FlockingConfig(num_agents=5)
+EPISODES, STEPS = 6, 30
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "set"
+    return collect(CollectConfig(env=WORLD, episodes=EPISODES, steps=STEPS, num_envs=4, output=str(path)))
+
+
+@pytest.fixture(autouse=True)
+def _without_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What follows the training takes longer than it, and is tested elsewhere."""
+    monkeypatch.setattr(training, "evaluate_policy", lambda *_: {})
+
+
+def run_bc(
+    runs: Path, dataset: Path, *, env: FlockingConfig = WORLD, model: str = "pair_force", **settings: Any
+) -> RunFolder:
+    small = {"batch_size": 16, "cloning_steps": 10, "cloning_updates": 20, "held_out": 2, "capacity": 10}
+    trainer = BCConfig(dataset=str(dataset), **{**small, **settings})
+    return train(
+        TrainConfig(
+            env=env,
+            model=ModelConfig(name=model, hops=2),
+            trainer=trainer,
+            runs=str(runs),
+        )
+    )
+
+
+def test_held_out_flights_are_not_trained_on(tmp_path: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: dict[range, set[int]] = {}
+    windows = FlightDataset.windows
+
+    def watched(storage: FlightWindows, index: torch.Tensor) -> Any:
+        absolute = index + storage.episodes.start * STEPS
+        read.setdefault(storage.episodes, set()).update((absolute // STEPS).tolist())
+        return windows(storage.dataset, absolute, storage.length)
+
+    monkeypatch.setattr(FlightWindows, "get", watched)
+    metrics = run_bc(tmp_path, dataset).read_metrics()
+    assert read == {range(4): {0, 1, 2, 3}, range(4, 6): {4, 5}}
+    assert len(metrics) == 20
+    assert {"5/loss", "5/validation_loss"} <= set(metrics[0])
+    assert {"5/error", "5/lost"} <= set(metrics[-1])
+
+
+def test_a_learner_fits_a_dataset(dataset: Path) -> None:
+    policy = make_model("modgnn_mlp", hops=2, seed=0)
+    buffer = FlightDataset.open(dataset).buffer(policy.window, 64, generator=torch.Generator().manual_seed(0))
+    learner = Learner(policy, BCConfig(averaging=0.9), (60, 60), seed=0)
+    before = learner.validate(buffer)
+    learner.fit(buffer, 60)
+    assert learner.validate(buffer) < 0.5 * before
+
+
+def test_one_seed_fixes_a_run_and_its_generators_are_kept(tmp_path: Path, dataset: Path) -> None:
+    runs = [run_bc(tmp_path, dataset, model="modgnn_mlp") for _ in range(2)]
+    assert runs[0].metrics_file.read_bytes() == runs[1].metrics_file.read_bytes()
+    states = [load_checkpoint(run.checkpoints).tensors["generators"]["5.batches"] for run in runs]
+    assert torch.equal(states[0], states[1])
+    assert not torch.equal(states[0], torch.Generator().manual_seed(0).get_state())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"env": FlockingConfig(num_agents=5, separation_gain=0.7)}, r"env.separation_gain=0.7 \(there 0.8\)"),
+        ({"env": FlockingConfig(num_agents=[5, 6])}, r"env.num_agents=\[5, 6\] \(there 5\)"),
+        ({"held_out": 6}, r"held_out=6 leaves nothing to train on of the 6 episodes"),
+        ({"dataset": "nowhere"}, "nowhere is no dataset of flights"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_a_run_is_made(
+    tmp_path: Path, dataset: Path, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        run_bc(tmp_path, **{"dataset": dataset, **settings})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_dataset_is_refused_before_a_run_is_made(tmp_path: Path, dataset: Path) -> None:
+    file = dataset / "shard_00001" / "state.memmap"
+    before = file.read_bytes()
+    try:
+        file.write_bytes(os.urandom(len(before)))
+        with pytest.raises(InputError, match=r"shard_00001 is damaged .state.memmap has changed"):
+            run_bc(tmp_path, dataset)
+    finally:
+        file.write_bytes(before)
+    assert list(tmp_path.iterdir()) == []
