@@ -1,14 +1,17 @@
-"""Flock-steps a second of the flocking environment, from the bare physics up to TorchRL's collector.
+"""Flock-steps a second of the flocking world, from the bare physics up to TorchRL's collector, and of its peers.
 
-    python benchmarks/flocking_speed.py                       # one thread, 32 agents, B = 1, 32, 256
+    python benchmarks/flocking_speed.py                       # one thread, 32 agents, B = 1, 32, 256, 1,024
     python benchmarks/flocking_speed.py --threads 2 --envs 32 --agents 64
+    python benchmarks/flocking_speed.py --peers               # PyBullet and VMAS too (VMAS: pip install vmas)
 
 Each row is the median over a few repetitions; a flock-step is one control step (five physics steps) of one flock.
+Compiled rows are measured after compiling.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import logging
 import platform
 import statistics
@@ -18,90 +21,112 @@ from collections.abc import Callable, Iterator
 import tensordict
 import torch
 import torchrl
-from tensordict.nn import TensorDictSequential
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
-from modgnn_rl.envs import FlockingEnv, TorchPhysics
+from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.envs.quadcopter import Dynamics
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.models import make_model
 
 REPETITIONS = 5
+BULLET_FLOCKS = 4
+VMAS_FLOCKS = 256
+
+Loop = Callable[[], int]
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
     parser.add_argument("--agents", type=int, default=32, help="agents in a flock")
-    parser.add_argument("--envs", type=int, nargs="+", default=[1, 32, 256], help="flocks in a batch, B")
-    parser.add_argument("--seconds", type=float, default=1.0, help="length of one repetition")
+    parser.add_argument("--envs", type=int, nargs="+", default=[1, 32, 256, 1024], help="flocks in a batch, B")
+    parser.add_argument("--seconds", type=float, default=1.5, help="length of one row")
+    parser.add_argument("--peers", action="store_true", help="measure PyBullet and VMAS too")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     print(
         f"torch {torch.__version__}, torchrl {torchrl.__version__}, tensordict {tensordict.__version__}, "
-        f"{platform.machine()}, {options.threads} thread(s), {options.agents} agents, eager, default allocator"
+        f"{platform.machine()}, {options.threads} thread(s), {options.agents} agents, default allocator\n"
     )
     table = {envs: measure(envs, options.agents, options.seconds) for envs in options.envs}
-    print(f"\n| flock-steps/s | {' | '.join(f'B = {envs}' for envs in options.envs)} |")
+    print(f"| flock-steps/s | {' | '.join(f'B = {envs:,}' for envs in options.envs)} |")
     print(f"|---|{'---:|' * len(options.envs)}")
     for name in next(iter(table.values())):
         print(f"| {name} | {' | '.join(f'{table[envs][name]:,.0f}' for envs in options.envs)} |")
+    if options.peers:
+        print("\n| peer | flock-steps/s |\n|---|---:|")
+        for name, flocks, step in peers(options.agents):
+            print(f"| {name} | {rate(step, flocks, options.seconds):,.0f} |", flush=True)
 
 
-@torch.no_grad()
 def measure(envs: int, agents: int, seconds: float) -> dict[str, float]:
     """Measure all rows for one batch size."""
-    return {name: rate(step, envs, seconds) for name, step in loops(envs, agents)}
+    rates = {}
+    for is_compiled in (False, True):
+        how = "compiled" if is_compiled else "eager"
+        for name, step in loops(envs, agents, is_compiled):
+            with torch.no_grad():
+                rates[f"{name}, {how}"] = rate(step, envs, seconds)
+    for name in ("pair_force", "modgnn_mlp"):
+        labelled = TensorDictSequential(make_model(name, seed=0), Reynolds())
+        with torch.no_grad():
+            rates[f"Collector, {name} flies, expert labels, eager"] = rate(
+                collect(envs, agents, labelled), envs, seconds
+            )
+    return rates
 
 
-def loops(envs: int, agents: int) -> Iterator[tuple[str, Callable[[], int]]]:
+def loops(envs: int, agents: int, compile: bool) -> Iterator[tuple[str, Loop]]:
     """Yield the rows: a name, and a function that flies some steps and returns how many."""
-    physics = TorchPhysics(envs, agents)
-    target = torch.zeros(envs, agents, 3)
+    config = FlockingConfig(compile=compile)
+    env = FlockingEnv(envs, agents, config=config, seed=0)
+    env.reset()
+    # Actions that change, so that nothing is found ready.
+    targets = [0.5 * torch.randn(envs, agents, 3) for _ in range(3)]
+    turn = 0
 
     def fly_physics() -> int:
-        physics.step(target)
+        nonlocal turn
+        turn += 1
+        env.physics.step(targets[turn % 3])
         return 1
 
-    yield "physics alone", fly_physics
+    yield "physics", fly_physics
 
-    env = FlockingEnv(envs, agents, seed=0)
+    expert = Reynolds.for_env(config)
+
+    def fly_world() -> int:
+        fly_physics()
+        position, velocity = env.physics.position, env.physics.velocity
+        env._hear(position)
+        expert.rule(position, velocity)
+        return 1
+
+    yield "physics, adjacency, expert's label", fly_world
+
     start = env.reset()
 
     def fly_environment() -> int:
-        start["agents", "action"] = target
+        nonlocal turn
+        turn += 1
+        start["agents", "action"] = targets[turn % 3]
         env.step(start)
         return 1
 
-    yield "environment: physics, adjacency, reward, done", fly_environment
+    yield "env.step", fly_environment
 
-    expert = Reynolds(action=("agents", "action"))
-
-    def fly_expert() -> int:
-        env.step(expert(start))
-        return 1
-
-    yield "environment and expert", fly_expert
-
-    for name, policy in policies():
-        tracked = TransformedEnv(FlockingEnv(envs, agents, seed=0), InitTracker())
-        if hasattr(policy, "make_tensordict_primer"):
-            tracked.append_transform(policy.make_tensordict_primer())
-        yield f"rollout, {name}", roll_out(tracked, policy)
-        labelled = TensorDictSequential(policy, Reynolds())
-        yield f"Collector with expert labels, {name}", collect(envs, agents, labelled)
+    pilot = Reynolds.for_env(config, action=("agents", "action"))
+    yield "env.rollout, the expert flies", roll_out(TransformedEnv(env, InitTracker()), pilot)
+    yield "Collector, the expert flies", collect(envs, agents, pilot, config)
 
 
-def policies() -> Iterator[tuple[str, TensorDictSequential]]:
-    """Yield what flies: nothing that computes, then the models."""
-    yield "expert as policy", Reynolds(action=("agents", "action"))
-    for name in ("pair_force", "modgnn_mlp"):
-        yield name, make_model(name, seed=0)
-
-
-def roll_out(env: TransformedEnv, policy: TensorDictSequential) -> Callable[[], int]:
+def roll_out(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> Loop:
     """A function that flies ten steps with ``env.rollout``."""
 
     def fly() -> int:
@@ -111,15 +136,16 @@ def roll_out(env: TransformedEnv, policy: TensorDictSequential) -> Callable[[], 
     return fly
 
 
-def collect(envs: int, agents: int, policy: TensorDictSequential) -> Callable[[], int]:
+def collect(envs: int, agents: int, policy: TensorDictModuleBase, config: FlockingConfig | None = None) -> Loop:
     """A function that flies ten steps with TorchRL's collector."""
     collector = Collector(
-        FlockingEnv(envs, agents, seed=0),
+        FlockingEnv(envs, agents, config=config, seed=0),
         policy,
         frames_per_batch=10 * envs,
         total_frames=-1,
         auto_register_policy_transforms=True,
         trust_policy=True,
+        no_cuda_sync=True,
     )
     batches = iter(collector)
 
@@ -130,9 +156,41 @@ def collect(envs: int, agents: int, policy: TensorDictSequential) -> Callable[[]
     return fly
 
 
-def rate(step: Callable[[], int], envs: int, seconds: float) -> float:
+def peers(agents: int) -> Iterator[tuple[str, int, Loop]]:
+    """Yield other simulators: a name, its flocks, and a function that flies some steps and returns how many."""
+    from modgnn_rl.envs.bullet import BulletPhysics
+
+    bullet = BulletPhysics(BULLET_FLOCKS, agents, Dynamics())
+    bullet.reset(
+        torch.arange(BULLET_FLOCKS), torch.rand(BULLET_FLOCKS, agents, 3) * 8, torch.zeros(BULLET_FLOCKS, agents, 3)
+    )
+    target = 0.5 * torch.randn(BULLET_FLOCKS, agents, 3)
+
+    def fly_bullet() -> int:
+        bullet.step(target)
+        return 1
+
+    yield "PyBullet, physics alone", BULLET_FLOCKS, fly_bullet
+    env = FlockingEnv(BULLET_FLOCKS, agents, physics="bullet", seed=0)
+    yield "PyBullet, env.rollout, the expert flies", BULLET_FLOCKS, roll_out(env, Reynolds(action=("agents", "action")))
+    try:
+        from torchrl.envs.libs.vmas import VmasEnv
+
+        vmas = VmasEnv("flocking", num_envs=VMAS_FLOCKS, n_agents=agents, continuous_actions=True, seed=0)
+    except ImportError:
+        return
+    yield f"VMAS flocking, env.rollout, B = {VMAS_FLOCKS}", VMAS_FLOCKS, roll_out(vmas, functools.partial(idle, vmas))
+
+
+def idle(env: EnvBase, data: TensorDictBase) -> TensorDictBase:
+    """Do nothing, at no cost."""
+    return data.update(env.full_action_spec.zero())
+
+
+def rate(step: Loop, envs: int, seconds: float) -> float:
     """Flock-steps a second: the median over the repetitions."""
-    step()
+    for _ in range(2):
+        step()
     rates = []
     for _ in range(REPETITIONS):
         begin, steps = time.perf_counter(), 0

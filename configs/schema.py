@@ -6,7 +6,8 @@ Values that differ from these defaults stand in the YAML files beside this modul
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, make_dataclass
 from typing import Any
 
 from omegaconf import MISSING
@@ -16,6 +17,7 @@ from modgnn_rl.settings import setting
 __all__ = [
     "REFERENCE_SIZE",
     "BCConfig",
+    "CollectConfig",
     "DAggerConfig",
     "EvaluateConfig",
     "EvaluationConfig",
@@ -25,6 +27,7 @@ __all__ = [
     "LoggerConfig",
     "ModelConfig",
     "TrainConfig",
+    "WorldChanges",
     "as_list",
 ]
 
@@ -33,7 +36,7 @@ MODEL_NAMES = ("pair_force", "modgnn_mlp", "no_pre", "no_mid", "gcn", "gcn_final
 REFERENCE_SIZE = 32  # the flock size to which start_radius, num_envs and receivers refer
 
 
-def as_list(value: int | list[int]) -> list[int]:
+def as_list(value: int | Sequence[int]) -> list[int]:
     """A setting that is one number or a list of them, as a list."""
     return [value] if isinstance(value, int) else list(value)
 
@@ -56,21 +59,71 @@ class FlockingConfig:
     separation_gain: float = setting(0.8, "expert: weight C_s of the Reynolds separation term", low=0)
     alignment_gain: float = setting(0.02, "expert: weight C_a of the Reynolds alignment term", low=0)
 
+    graph: str = setting(
+        "matrix", "form of the adjacency: matrix [N, N], or list of links [2, E]", choices=("matrix", "links")
+    )
+    max_links: int = setting(
+        64, "graph=links: room in the list for this many links an agent, on average over a flock", low=1
+    )
+
+    start: str = setting(
+        "ball",
+        "where agents start: uniform in a ball, on a grid, or in several balls",
+        choices=("ball", "grid", "clusters"),
+    )
     start_radius: float = setting(
         4.0, "radius of the starting ball of 32 agents, m; it scales with (N / 32)^(1/3)", above=0
     )
     start_distance: float = setting(0.3, "smallest distance between two agents at the start, m", low=0)
+    start_clusters: int = setting(3, "start=clusters: number of clusters", low=1)
+    leader: str = setting(
+        "noise",
+        "how the leader flies: integrated noise, from one random waypoint to the next, or in a circle",
+        choices=("noise", "waypoints", "circle"),
+    )
     leader_noise: float = setting(
-        0.10, "leader: its target velocity gains N(0, leader_noise^2 dt) each step, m/s^1.5", low=0
+        0.10, "leader=noise: its target velocity gains N(0, leader_noise^2 dt) each step, m/s^1.5", low=0
     )
     leader_max_speed: float = setting(
-        0.8, "leader: its target velocity is kept in the ball of this radius, m/s", above=0
+        0.8, "leader=noise: its target velocity is kept in the ball of this radius, m/s", above=0
+    )
+    leader_speed: float = setting(0.5, "leader=waypoints or circle: its speed, m/s", low=0)
+    leader_radius: float = setting(
+        5.0, "leader=circle: radius, m; leader=waypoints: they lie within this distance of the origin, m", above=0
     )
 
-    physics: str = setting("torch", "physics engine", choices=("torch",))
+    physics: str = setting("torch", "physics engine", choices=("torch", "bullet"))
     control_frequency: float = setting(48.0, "control steps a second, Hz", above=0)
     physics_substeps: int = setting(5, "physics steps in a control step (5 x 48 Hz = 240 Hz)", low=1)
     velocity_gain: float = setting(1.0, "velocity controller: proportional gain k_p, 1/s", above=0)
+    collisions: bool = setting(False, "whether agents bounce off each other; physics=bullet only")
+    ground: float | None = setting(None, "height of a floor without friction, m; null: no floor")
+    linear_damping: float = setting(0.0, "Bullet's damping d of velocities, a = -d v (1 + |v|)", low=0)
+    angular_damping: float = setting(0.0, "Bullet's damping d of angular velocities, as that of velocities", low=0)
+    drag: float = setting(0.0, "drag of the rotors, as a multiple of the Crazyflie's as measured", low=0)
+    motor_lag: float = setting(0.0, "time constant with which rotor thrusts follow their commands, s", low=0)
+    compile: bool = setting(False, "compile physics, graph and expert: seconds at the start, then faster")
+
+    message_loss: float = setting(
+        0.0, "fault: probability that a message does not arrive, for each link and step", low=0, high=1
+    )
+    delay: int = setting(
+        0, "fault: control steps by which observations, and with them the messages made of them, are late", low=0
+    )
+    range_spread: float = setting(
+        0.0,
+        "fault: each agent is heard within comm_range (1 + x), x uniform in +-range_spread, drawn for each flight",
+        low=0,
+        high=1,
+    )
+    position_noise: float = setting(0.0, "fault: standard deviation of observed positions, m", low=0)
+    velocity_noise: float = setting(0.0, "fault: standard deviation of observed velocities, m/s", low=0)
+    dropout_rate: float = setting(
+        0.0, "fault: how often a follower drops out, 1/s; it hovers, and neither hears nor is heard", low=0
+    )
+    dropout_time: float = setting(2.0, "fault: mean time until one that dropped out comes back, s", above=0)
+    wind: float = setting(0.0, "fault: standard deviation of the gusts that push a flock, m/s^2 along each axis", low=0)
+    wind_time: float = setting(1.0, "fault: time over which gusts change, s", above=0)
 
     max_distance: float = setting(
         30.0, "a flock has diverged when an agent is farther than this from its centre of mass, m", above=0
@@ -86,6 +139,28 @@ class FlockingConfig:
     def sizes(self) -> list[int]:
         """``num_agents`` as a list."""
         return as_list(self.num_agents)
+
+    @property
+    def hides_state(self) -> bool:
+        """Whether agents observe something else than their state."""
+        return self.delay > 0 or self.position_noise > 0 or self.velocity_noise > 0
+
+    @property
+    def state_key(self) -> tuple[str, str]:
+        """Where the true positions and velocities are."""
+        return ("agents", "state" if self.hides_state else "observation")
+
+
+_FLOWN_OTHERWISE = ("num_agents", "max_steps")  # settings of the evaluation
+WorldChanges = make_dataclass(
+    "WorldChanges",
+    [
+        (entry.name, Any, field(default=None, metadata=entry.metadata))
+        for entry in fields(FlockingConfig)
+        if entry.name not in _FLOWN_OTHERWISE
+    ],
+    namespace={"__doc__": "Settings of a world that differ from those of training; null: as in training."},
+)
 
 
 @dataclass
@@ -134,6 +209,9 @@ class BCConfig(ImitationConfig):
     cloning_steps: int = setting(1000, "steps that the expert flies", low=1)
     cloning_updates: int = setting(6000, "updates on its flights, shared by the sizes", low=1)
     held_out: int = setting(8, "flocks whose flights are kept for the validation error", low=1)
+    dataset: str | None = setting(
+        None, "folder made by modgnn_rl.collect, whose flights are cloned; null: the expert flies num_envs flocks"
+    )
 
 
 @dataclass
@@ -198,10 +276,27 @@ class TrainConfig:
 
 
 @dataclass
+class CollectConfig:
+    """A dataset of the expert's flights."""
+
+    env: FlockingConfig = field(default_factory=FlockingConfig)
+    episodes: int = setting(1000, "flights; more than a dataset has are added to it", low=1)
+    steps: int | None = setting(None, "steps of a flight, none of which ends early; null: env.max_steps", low=1)
+    num_envs: int = setting(
+        50, "flocks flown at once; their flights are held in memory, and one part of the dataset", low=1
+    )
+    seed: int = setting(0, "fixes everything that is drawn", low=0, high=2**32)
+    output: str | None = setting(None, "folder of the dataset; null: datasets/<number of agents>-agents")
+    device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
+    threads: int = setting(1, "threads of torch on the CPU; 0: one a core", low=0)
+
+
+@dataclass
 class EvaluateConfig:
     """Evaluation of a finished run."""
 
     run: str = setting(MISSING, "run folder")
+    env: Any = field(default_factory=WorldChanges)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
     threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)

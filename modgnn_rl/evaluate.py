@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from modgnn_rl.command import run_command
-from modgnn_rl.configs.schema import EvaluateConfig
+from modgnn_rl.configs.schema import EvaluateConfig, WorldChanges
 
 
 def main(config: EvaluateConfig) -> None:
     """Fly a trained policy beside its expert and beside doing nothing, and print and save the table."""
     from modgnn_rl.training import evaluate_run
 
-    run = evaluate_run(config)
-    print(f"The table is in {run.path / 'evaluation.md'}, all figures in {run.path / 'evaluation.json'}")
+    file = evaluate_run(config)
+    print(f"The table is in {file.with_suffix('.md')}, all figures in {file}")
 
 
 if __name__ == "__main__":
-    run_command(main, EvaluateConfig, "evaluate")
+    run_command(main, EvaluateConfig, "evaluate", nodes={"env/changes": WorldChanges})

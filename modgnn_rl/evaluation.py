@@ -118,7 +118,7 @@ def fly(
     tensordict = env.reset()
     with set_recurrent_mode(False):
         for step in range(steps):
-            position = tensordict["agents", "observation"][..., :3]
+            position = tensordict[config.state_key][..., :3]
             tensordict = expert(policy(tensordict))
             agents = tensordict["agents"]
             error = action_error(agents["action"], agents["expert_action"], agents["controlled"])
@@ -149,7 +149,7 @@ def fly(
         smallest_distance=closest,
         near_collisions=means["near_collisions"],
         reward=means["reward"] * steps,
-        lost=is_lost(tensordict["agents", "observation"][..., :3], config.comm_range),
+        lost=is_lost(tensordict[config.state_key][..., :3], config.comm_range),
         diverged=diverged,
     )
 

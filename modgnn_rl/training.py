@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
 from modgnn_rl.errors import InputError
@@ -70,10 +72,11 @@ def evaluate_policy(
     settings: EvaluationConfig,
     sizes: list[int],
     device: str,
+    changes: str = "",
 ) -> dict[int, dict[str, Any]]:
     """Fly a run's policy and the reference policies, and write the table of each size into the run folder.
 
-    Tables of other sizes that the folder holds already are kept.
+    Tables of other sizes that the folder holds already are kept; a world changed since training has files of its own.
 
     Returns:
         for each number of agents, the table that `modgnn_rl.table.summarise_flights` makes.
@@ -92,16 +95,30 @@ def evaluate_policy(
         tables[size] = summarise_flights(flights, settings.seed)
     flown = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
     new = {str(size): {**flown, "rows": table} for size, table in tables.items()}
-    print(f"\n{as_markdown(new, run.path.name)}", flush=True)
-    file = run.path / "evaluation.json"
+    title = f"{run.path.name} in a world with {changes}" if changes else run.path.name
+    print(f"\n{as_markdown(new, title)}", flush=True)
+    file = evaluation_file(run, changes)
     entries = sorted({**read_tables(file), **new}.items(), key=lambda entry: int(entry[0]))
     run.write(file.name, json.dumps(dict(entries), indent=2) + "\n")
-    run.write("evaluation.md", as_markdown(dict(entries), run.path.name))
+    run.write(file.with_suffix(".md").name, as_markdown(dict(entries), title))
     return tables
 
 
-def evaluate_run(config: EvaluateConfig) -> RunFolder:
-    """Evaluate the policy of a run.
+def evaluation_file(run: RunFolder, changes: str = "") -> Path:
+    """Where the figures of an evaluation are, in the world of training or in a changed one; the table is beside them.
+
+    Args:
+        run: the run folder.
+        changes: ``name=value`` of all that was changed, separated by commas.
+    """
+    return run.path / (f"evaluation-{changes.replace('/', '_')}.json" if changes else "evaluation.json")
+
+
+def evaluate_run(config: EvaluateConfig) -> Path:
+    """Evaluate the policy of a run, in the world that it was trained in or in another.
+
+    Returns:
+        the file of figures.
 
     Raises:
         InputError: a bad setting, no such run, no readable policy in it, or no such device.
@@ -110,10 +127,15 @@ def evaluate_run(config: EvaluateConfig) -> RunFolder:
     prepare_torch(config.device, config.threads)
     policy = load_policy(config.run, device=config.device)
     run = RunFolder.open(config.run)
-    world = stored_world(run)
+    changes = {name: value for name, value in vars(config.env).items() if value is not None}
+    try:
+        world: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(stored_world(run)), changes))
+    except OmegaConfBaseException as error:
+        raise InputError(f"env.{error.full_key}: {str(error.msg).splitlines()[0]}") from error
     sizes = as_list(config.evaluation.num_agents or world.num_agents)
-    evaluate_policy(run, policy, world, config.evaluation, sizes, config.device)
-    return run
+    named = ",".join(f"{name}={value}" for name, value in sorted(changes.items()))
+    evaluate_policy(run, policy, world, config.evaluation, sizes, config.device, named)
+    return evaluation_file(run, named)
 
 
 def prepare_torch(device: str, threads: int) -> None:

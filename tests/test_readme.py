@@ -20,7 +20,7 @@ def python_of(page: Path) -> list[str]:
 
 
 def test_there_is_python_to_run():
-    assert len(python_of(README)) == 2
+    assert len(python_of(README)) == 3
     assert len(python_of(ROOT / "docs" / "modgnn.md")) > 10
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from modgnn_rl.configs.schema import (
     LoggerConfig,
     ModelConfig,
     TrainConfig,
+    WorldChanges,
 )
 from modgnn_rl.errors import InputError
 from modgnn_rl.run_folder import RunFolder
@@ -69,7 +71,7 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
 def test_a_checkpoint_holds_what_a_run_is_made_of(run):
     checkpoint = load_checkpoint(run.checkpoints)
     assert set(checkpoint.tensors) == {"policy", "trained", "optimizer", "generators"}
-    assert set(checkpoint.tensors["generators"]) == {"learner", "5.env", "5.mixture", "5.batches"}
+    assert set(checkpoint.tensors["generators"]) == {"learner", "5.env", "5.faults", "5.mixture", "5.batches"}
     assert checkpoint.state["config"] == run.config
     assert checkpoint.state["updates"] == checkpoint.state["averaged"] == checkpoint.step == 10
 
@@ -112,6 +114,21 @@ def test_evaluation_at_other_sizes(run):
     evaluate_run(EvaluateConfig(run=str(run.path), evaluation=settings, threads=1))
     tables = json.loads((run.path / "evaluation.json").read_text())
     assert {size: table["num_flocks"] for size, table in tables.items()} == {"3": 2, "5": 3, "7": 2}
+
+
+def test_evaluation_in_another_world_has_files_of_its_own(run):
+    before = (run.path / "evaluation.json").read_text()
+    changes = WorldChanges(message_loss=0.5, physics="bullet")
+    config = EvaluateConfig(
+        run=str(run.path), evaluation=EvaluationConfig(num_flocks=2, steps=4), threads=1, env=changes
+    )
+    file = evaluate_run(config)
+    assert file.name == "evaluation-message_loss=0.5,physics=bullet.json"
+    assert "in a world with message_loss=0.5,physics=bullet" in file.with_suffix(".md").read_text()
+    assert json.loads(file.read_text())["5"]["num_flocks"] == 2
+    assert (run.path / "evaluation.json").read_text() == before
+    with pytest.raises(InputError, match=r"env\.max_links"):
+        evaluate_run(dataclasses.replace(config, env=WorldChanges(max_links="many")))
 
 
 def test_one_seed_fixes_a_run(tmp_path):

@@ -99,6 +99,7 @@ class Flocks:
         size = self.num_agents
         return {
             f"{size}.env": self.env.generator,
+            f"{size}.faults": self.env.faults.generator,
             f"{size}.mixture": self.mixture.generator,
             f"{size}.batches": self.buffer._rng,
         }

@@ -113,7 +113,7 @@ def flight_metrics(flights: TensorDictBase, world: FlockingConfig) -> dict[str, 
     flown = agents["controlled"] & ~flights["expert_flies"]
     error = action_error(agents["action"], agents["expert_action"], flown).nanmean()
     frames = torch.linspace(0, flights.shape[1] - 1, FRAMES).long()
-    position = agents["observation"][:, frames, :, :3]
+    position = flights[world.state_key][:, frames, :, :3]
     measured = {
         "error": error,
         "leader_distance": leader_distance(position).mean(),
