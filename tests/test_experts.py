@@ -334,7 +334,7 @@ def test_local_reynolds_reads_lists_of_links(seed: int, agents: int, hops: int) 
 def test_one_that_comes_back_begins_with_nothing(form: str) -> None:
     """Agent 2 is away at the second of four steps; what it observes then is worth nothing."""
     states = [torch.cat(flock(n, 1, 4), -1) for n in range(4)]
-    states[1][0, 2] = torch.nan
+    states[1][0, 2] = 1.5
     graph = everybody(4).unsqueeze(0)
     adjacency = graph if form == "matrix" else as_links(graph, 16)
     expert, last, actions = LocalReynolds(), None, []
