@@ -27,7 +27,7 @@ from modgnn_rl.seeds import derive_seed
 from modgnn_rl.settings import check, suggestion
 from modgnn_rl.tensors import clip_to_ball
 
-__all__ = ["FlockingEnv", "make_physics"]
+__all__ = ["FlockingEnv", "checked_config", "make_physics"]
 
 AWAY = 1e4  # m; where agents that do not exist are kept, as far from each other
 
@@ -91,7 +91,7 @@ class FlockingEnv(EnvBase):
         stagger: bool = False,
         **settings: Any,
     ) -> None:
-        self.config = _checked_config(config, settings)
+        self.config = checked_config(config, settings)
         sizes = as_list(self.config.num_agents if num_agents is None else num_agents)
         for name, counts in (("num_envs", [num_envs]), ("num_agents", sizes)):
             for count in counts:
@@ -256,6 +256,8 @@ class FlockingEnv(EnvBase):
         config, faults = self.config, self.faults
         taking_part = self.exists & faults.running if self.has_mask else None
         if config.graph == "links":
+            if self.is_mixed:
+                position = position.masked_fill(~self.exists.unsqueeze(-1), torch.nan)
             return hear_near_pairs(position, faults, taking_part, config.collision_distance, self._room)
         reach = config.comm_range if faults.reach is None else faults.reach
         adjacency, touching = self._hear_all_pairs(position, reach, config.collision_distance)
@@ -358,7 +360,7 @@ def judge(
     return torch.cat((position, velocity), -1), reward, terminated
 
 
-def _checked_config(config: FlockingConfig | None, settings: dict[str, Any]) -> FlockingConfig:
+def checked_config(config: FlockingConfig | None, settings: dict[str, Any]) -> FlockingConfig:
     """The configuration of an environment, from one of the two."""
     if config is not None and settings:
         raise InputError(f"give either a config or settings, not both: {', '.join(settings)}")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,7 +20,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking import FlockingEnv
-from modgnn_rl.envs.rendering import Flock, Renderer, check_render_mode, has_display
+from modgnn_rl.envs.rendering import RENDER_MODES, Flock, Renderer, check_render_mode, has_display
 from modgnn_rl.errors import InputError
 from modgnn_rl.seeds import derive_seed
 from modgnn_rl.settings import suggestion
@@ -30,6 +30,7 @@ __all__ = ["Flocks", "GymnasiumFlocking", "GymnasiumFlocks", "as_array"]
 Array = NDArray[Any]
 Observation = dict[str, Array]
 FRAMES_PER_SECOND = 48
+FAR = float(np.finfo(np.float32).max)  # Gymnasium warns of spaces without bounds
 
 
 class Flocks:
@@ -45,7 +46,7 @@ class Flocks:
         agents = self.env.num_agents
         speed = self.env.config.max_speed
         seen: dict[str, spaces.Space[Any]] = {
-            "observation": spaces.Box(-np.inf, np.inf, (agents, 6), np.float32),
+            "observation": spaces.Box(-FAR, FAR, (agents, 6), np.float32),
             "controlled": spaces.MultiBinary(agents),
         }
         if self.env.has_mask:
@@ -169,8 +170,8 @@ class GymnasiumFlocking(gymnasium.Env[Observation, Array]):
         InputError: on one out of range, a bad state or a bad action.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # Gymnasium declares it for instances
-        "render_modes": ["human", "rgb_array"] if has_display() else ["rgb_array"],
+    metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
+        "render_modes": list(RENDER_MODES),
         "render_fps": FRAMES_PER_SECOND,
     }
 
@@ -185,6 +186,8 @@ class GymnasiumFlocking(gymnasium.Env[Observation, Array]):
     ) -> None:
         self._flocks = Flocks(1, num_agents, render_mode, (width, height), **settings)
         self.render_mode = render_mode
+        if not has_display():  # what works here; the class says what there is, so that a window is refused by name
+            self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}
         self.observation_space = self._flocks.observation_space
         self.action_space = self._flocks.action_space
 
@@ -237,7 +240,7 @@ class GymnasiumFlocks(VectorEnv[Observation, Array, Array]):
         settings: fields of `modgnn_rl.configs.schema.FlockingConfig`.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # as above
+    metadata: dict[str, Any] = {  # noqa: RUF012  # as above
         **GymnasiumFlocking.metadata,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }

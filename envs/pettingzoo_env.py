@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
-from modgnn_rl.envs.gymnasium_env import Flocks, GymnasiumFlocking, as_array
+from modgnn_rl.envs.gymnasium_env import FAR, Flocks, GymnasiumFlocking, as_array
 from modgnn_rl.errors import InputError
 
 try:
@@ -59,9 +59,9 @@ class PettingZooFlocking(ParallelEnv[str, dict[str, Array], Array]):
         speed = self._flocks.env.config.max_speed
         seen = spaces.Dict(
             {
-                "observation": spaces.Box(-np.inf, np.inf, (6,), np.float32),
+                "observation": spaces.Box(-FAR, FAR, (6,), np.float32),
                 "heard": spaces.MultiBinary(num_agents),
-                "neighbours": spaces.Box(-np.inf, np.inf, (num_agents, 6), np.float32),
+                "neighbours": spaces.Box(-FAR, FAR, (num_agents, 6), np.float32),
             }
         )
         self.observation_spaces = dict.fromkeys(self.possible_agents, seen)

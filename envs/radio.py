@@ -23,8 +23,9 @@ def hear_all_pairs(position: Tensor, reach: Tensor | float, collision_distance: 
     Returns:
         the adjacency, bool [B, N, N], whose entry i, j says that i hears j; which agents touch another, bool [B, N].
     """
-    distance = pair_distances(position)
-    reach = reach.unsqueeze(-2) if isinstance(reach, Tensor) else reach
+    distance = pair_distances(position)  # infinite to oneself, so that no reach may be
+    farthest = torch.finfo(position.dtype).max
+    reach = reach.clamp(max=farthest).unsqueeze(-2) if isinstance(reach, Tensor) else min(reach, farthest)
     return distance <= reach, distance.amin(-1) < collision_distance
 
 

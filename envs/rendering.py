@@ -1,13 +1,14 @@
 """Pictures of a flock: agents, the leader in red, target velocities as blue arrows, communication links in yellow.
 
 A picture is a function of the state alone, so that it is the same whichever engine moves the flock. PyBullet draws
-the solid parts, one triangle mesh a colour, with its software renderer or in its window. The software renderer knows
-no lines, and neither edges that are smooth nor colours that let others through: it draws at twice the size, and the
-links are laid over its image, hidden by what lies nearer.
+the solid parts with its software renderer or in its window. The software renderer knows no lines, and neither edges
+that are smooth nor colours that let others through: it draws at twice the size, and the links are laid over its image,
+hidden by what lies nearer.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modgnn_rl.envs.shapes import ARROW, QUADCOPTER, along, copies, normals, rotations
+from modgnn_rl.envs.shapes import ARROW, QUADCOPTER, normals, quaternions_along
 from modgnn_rl.errors import InputError
 
 __all__ = ["RENDER_MODES", "Flock", "Renderer", "check_render_mode", "has_display"]
@@ -27,18 +28,20 @@ ARROW_TIME = 1.0  # s; an arrow is as long as the way flown in this time
 ARM = (0.11, 0.025)  # m, and share of the view: arms of agents, drawn longer than they are so that one sees them
 LEADER_SCALE = 1.3
 MAX_LINKS = 10_000  # the shortest are drawn
-AGENTS_IN_MESH = 32  # PyBullet's meshes are limited in size
 VIEW = np.array([-0.45, -0.85, 0.38])  # from the flock to the camera
 FIELD_OF_VIEW = 30.0  # of the height, degrees
 SMALLEST_VIEW = 1.0  # m from the centre to the edge
 OVERSAMPLING = 2
 BACKGROUND = np.array([[251, 252, 254], [229, 234, 241]])  # at the top and at the bottom
-HAZE = 0.5  # share of the background in what is farthest away
-FOLLOWER_COLOUR = (0.12, 0.15, 0.22)
-LEADER_COLOUR = (0.86, 0.08, 0.10)
-ARROW_COLOUR = (0.10, 0.38, 0.90)
+WINDOW_BACKGROUND = " ".join(f"--background_color_{name}=0.95" for name in ("red", "green", "blue"))
+HAZE = 0.4  # share of the background in what is farthest away
+MESHES = {
+    "follower": (QUADCOPTER, (0.12, 0.15, 0.22)),
+    "leader": (LEADER_SCALE * QUADCOPTER, (0.86, 0.08, 0.10)),
+    "arrow": (ARROW, (0.10, 0.38, 0.90)),
+}
 LINK_COLOUR = (0.96, 0.74, 0.05)
-LINK_OPACITY = 0.42
+LINK_OPACITY = 0.5
 
 
 class Flock(NamedTuple):
@@ -55,6 +58,14 @@ class Flock(NamedTuple):
     quaternion: Array
     target_velocity: Array
     adjacency: Array
+
+
+class Look(NamedTuple):
+    """What a body looks like: a mesh of `MESHES`, its width and its length along its z axis, m."""
+
+    mesh: str
+    width: float
+    length: float
 
 
 class Camera(NamedTuple):
@@ -95,12 +106,16 @@ class Renderer:
         pybullet = import_pybullet()
         self.bullet = pybullet
         self.render_mode, self.width, self.height = render_mode, width, height
-        self.shown: list[int] = []
+        # PyBullet never gives back the memory of a shape: each is made once, and bodies that stay the same are moved.
+        self.shapes: dict[Look, int] = {}
+        self.shown: dict[tuple[str, int], tuple[Look, int]] = {}
+        self.lines: list[int] = []
         if render_mode == "rgb_array":
             self.client = pybullet.connect(pybullet.DIRECT)
             return
         try:
-            self.client = pybullet.connect(pybullet.GUI, options=f"--width={width} --height={height}")
+            options = f"--width={width} --height={height} {WINDOW_BACKGROUND}"
+            self.client = pybullet.connect(pybullet.GUI, options=options)
         except pybullet.error as error:
             raise InputError(f"PyBullet could not open a window ({error}); close the other one first") from error
         pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=self.client)
@@ -153,35 +168,46 @@ class Renderer:
         return Camera(target, distance, view, self.bullet.computeProjectionMatrixFOV(FIELD_OF_VIEW, aspect, near, far))
 
     def _solids(self, flock: Flock, camera: Camera) -> None:
-        """Put agents and arrows into the world."""
-        arm = max(ARM[0], ARM[1] * camera.distance * np.tan(np.radians(FIELD_OF_VIEW / 2)))
-        for start in range(0, len(flock.position), AGENTS_IN_MESH):
-            part = slice(start, start + AGENTS_IN_MESH)
-            position, turned = flock.position[part], arm * rotations(flock.quaternion[part])
-            first = 1 if start == 0 else 0
-            self._add(copies(QUADCOPTER, turned[first:], position[first:]), FOLLOWER_COLOUR)
-            self._add(copies(QUADCOPTER, LEADER_SCALE * turned[:first], position[:first]), LEADER_COLOUR)
-            arrows = along(ARROW_TIME * flock.target_velocity[part], 0.18 * arm)
-            self._add(copies(ARROW, arrows, position), ARROW_COLOUR)
+        """Put agents and arrows into the world, and take out those that are not there any more."""
+        arm = round(max(ARM[0], ARM[1] * camera.distance * np.tan(np.radians(FIELD_OF_VIEW / 2))), 2)
+        lengths = (ARROW_TIME * np.linalg.norm(flock.target_velocity, axis=-1)).round(2).tolist()
+        directions = quaternions_along(flock.target_velocity)
+        gone = set(self.shown)
+        for index, length in enumerate(lengths):
+            parts = [("agent", Look("follower" if index else "leader", arm, arm), flock.quaternion[index])]
+            if length:
+                parts.append(("arrow", Look("arrow", round(0.18 * arm, 3), length), directions[index]))
+            for name, look, quaternion in parts:
+                self._put((name, index), look, flock.position[index], quaternion)
+                gone.discard((name, index))
+        for place in gone:
+            self.bullet.removeBody(self.shown.pop(place)[1], physicsClientId=self.client)
 
-    def _add(self, mesh: Array, colour: tuple[float, float, float]) -> None:
-        """Put triangles [T, 3, 3] into the world."""
-        if not len(mesh):
+    def _put(self, place: tuple[str, int], look: Look, position: Array, quaternion: Array) -> None:
+        """Show one body: the one that was in its place, if that looks as it should, or a new one."""
+        bullet, client = self.bullet, self.client
+        old, body = self.shown.get(place, (None, -1))
+        if old == look:
+            bullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
             return
-        shape = self.bullet.createVisualShape(
-            self.bullet.GEOM_MESH,
-            vertices=mesh.reshape(-1, 3).tolist(),
-            indices=list(range(3 * len(mesh))),
-            normals=normals(mesh).reshape(-1, 3).tolist(),
-            rgbaColor=(*colour, 1.0),
-            physicsClientId=self.client,
-        )
-        self.shown.append(self.bullet.createMultiBody(0, baseVisualShapeIndex=shape, physicsClientId=self.client))
+        if old is not None:
+            bullet.removeBody(body, physicsClientId=client)
+        body = bullet.createMultiBody(0, -1, self._shape(look), position, quaternion, physicsClientId=client)
+        self.shown[place] = (look, body)
 
-    def _clear(self) -> None:
-        for body in self.shown:
-            self.bullet.removeBody(body, physicsClientId=self.client)
-        self.shown.clear()
+    def _shape(self, look: Look) -> int:
+        if look not in self.shapes:
+            mesh, colour = MESHES[look.mesh]
+            mesh = mesh * (look.width, look.width, look.length)
+            self.shapes[look] = self.bullet.createVisualShape(
+                self.bullet.GEOM_MESH,
+                vertices=mesh.reshape(-1, 3).tolist(),
+                indices=list(range(3 * len(mesh))),
+                normals=normals(mesh).reshape(-1, 3).tolist(),
+                rgbaColor=(*colour, 1.0),
+                physicsClientId=self.client,
+            )
+        return self.shapes[look]
 
     def _picture(self, flock: Flock, camera: Camera, links: Array) -> Array:
         """The picture, uint8 [H, W, 3]."""
@@ -200,33 +226,56 @@ class Renderer:
             renderer=bullet.ER_TINY_RENDERER,
             physicsClientId=self.client,
         )
-        self._clear()
         fine = np.linspace(BACKGROUND[0], BACKGROUND[1], height).astype(np.float32)[:, None].repeat(width, 1)
         depth = np.reshape(depth, (height, width))
         solid = np.reshape(bodies, (height, width)) >= 0
         fine[solid] += (np.reshape(colours, (height, width, 4))[solid][:, :3] - fine[solid]) * _clearness(depth[solid])
         _overlay(fine, depth, camera.project(links.reshape(-1, 3), width, height).reshape(-1, 2, 3))
-        image = fine.reshape(self.height, OVERSAMPLING, self.width, OVERSAMPLING, 3)
-        return (image.sum((1, 3)) / OVERSAMPLING**2).round().astype(np.uint8)
+        offsets = range(OVERSAMPLING)
+        parts = [fine[row::OVERSAMPLING, column::OVERSAMPLING] for row in offsets for column in offsets]
+        image: Array = sum(parts[1:], parts[0]) / len(parts)
+        return image.round().astype(np.uint8)
 
     def _show(self, flock: Flock, camera: Camera, links: Array) -> None:
         """Draw in the window; links are lines there."""
         bullet, client = self.bullet, self.client
         bullet.configureDebugVisualizer(bullet.COV_ENABLE_RENDERING, 0, physicsClientId=client)
-        self._clear()
+        is_new = not self.shown
         self._solids(flock, camera)
-        bullet.removeAllUserDebugItems(physicsClientId=client)
-        for begin, end in links.tolist():
-            bullet.addUserDebugLine(begin, end, LINK_COLOUR, physicsClientId=client)
-        yaw = np.degrees(np.arctan2(VIEW[1], VIEW[0])) + 90
-        pitch = -np.degrees(np.arcsin(VIEW[2] / np.linalg.norm(VIEW)))
-        bullet.resetDebugVisualizerCamera(camera.distance / 2, yaw, pitch, camera.target, physicsClientId=client)
+        old, self.lines = self.lines, []
+        for index, (begin, end) in enumerate(links.tolist()):
+            replaced = old[index] if index < len(old) else -1
+            line = bullet.addUserDebugLine(
+                begin, end, LINK_COLOUR, replaceItemUniqueId=replaced, physicsClientId=client
+            )
+            self.lines.append(line)
+        for line in old[len(links) :]:
+            bullet.removeUserDebugItem(line, physicsClientId=client)
+        # The window follows the flock; from where and how far away is for the user's mouse to say.
+        yaw, pitch, distance = bullet.getDebugVisualizerCamera(physicsClientId=client)[8:11]
+        if is_new:
+            yaw = np.degrees(np.arctan2(VIEW[1], VIEW[0])) + 90
+            pitch = -np.degrees(np.arcsin(VIEW[2] / np.linalg.norm(VIEW)))
+            distance = 0.4 * camera.distance  # its field of view is wider
+        bullet.resetDebugVisualizerCamera(distance, yaw, pitch, camera.target, physicsClientId=client)
         bullet.configureDebugVisualizer(bullet.COV_ENABLE_RENDERING, 1, physicsClientId=client)
 
 
 def has_display() -> bool:
-    """Whether there is a display for a window."""
-    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    """Whether there is a display for a window; on Linux, an X server that answers."""
+    if not sys.platform.startswith("linux"):
+        return True
+    if not os.environ.get("DISPLAY"):
+        return False
+    try:  # PyBullet would end the process
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return False
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    display = x11.XOpenDisplay(None)
+    if display:
+        x11.XCloseDisplay(ctypes.c_void_p(display))
+    return bool(display)
 
 
 def check_render_mode(render_mode: str | None) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ARROW", "QUADCOPTER", "along", "copies", "normals", "rotations"]
+__all__ = ["ARROW", "QUADCOPTER", "normals", "quaternions_along"]
 
 Array = NDArray[Any]
 
@@ -42,7 +42,8 @@ def _tube(radius: float, bottom: float, top: float, sides: int) -> Array:
 
 def _quadcopter() -> Array:
     """Two crossed bars and four rotors, the arms being 1 long."""
-    diagonal = rotations(np.array([[0, 0, np.sin(np.pi / 8), np.cos(np.pi / 8)]]))[0]
+    half = np.sqrt(0.5)
+    diagonal = np.array(((half, -half, 0), (half, half, 0), (0, 0, 1)))
     bars = np.concatenate((_box((-1, -0.1, -0.08), (1, 0.1, 0.08)), _box((-0.1, -1, -0.08), (0.1, 1, 0.08))))
     rotor = np.concatenate((_cone(0.55, 0.14, 0.2, 10), _cone(0.55, 0.14, 0.08, 10)[:, ::-1]))
     rotors = [rotor + np.array((x, y, 0)) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))]
@@ -56,30 +57,14 @@ def normals(mesh: Array) -> Array:
     return np.repeat((normal / np.maximum(length, 1e-30))[:, None], 3, 1)
 
 
-def copies(mesh: Array, transforms: Array, positions: Array) -> Array:
-    """Copies of a mesh, each transformed by a matrix [K, 3, 3] and put at a position [K, 3], as one mesh."""
-    return (np.einsum("kij,tcj->ktci", transforms, mesh) + positions[:, None, None]).reshape(-1, 3, 3)
-
-
-def along(vectors: Array, width: float) -> Array:
-    """Matrices [K, 3, 3] that take the z axis to vectors [K, 3], and the axes beside it to what is ``width`` long."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    axis = np.where(length > 0, vectors / np.maximum(length, 1e-30), (0.0, 0.0, 1.0))
-    helper = np.where(np.abs(axis[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    side = np.cross(helper, axis)
-    side /= np.linalg.norm(side, axis=-1, keepdims=True)
-    return np.stack((width * side, width * np.cross(axis, side), vectors), -1)
-
-
-def rotations(quaternions: Array) -> Array:
-    """Rotation matrices [K, 3, 3] of unit quaternions x, y, z, w [K, 4]."""
-    x, y, z, w = np.moveaxis(quaternions, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+def quaternions_along(vectors: Array) -> Array:
+    """Quaternions x, y, z, w [K, 4] that turn the z axis into the direction of vectors [K, 3]."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    length = np.sqrt(x * x + y * y + z * z)
+    half_turn = np.stack((-y, x, np.zeros_like(z), length + z), -1)  # its length is twice a half angle's cosine
+    norm = np.linalg.norm(half_turn, axis=-1, keepdims=True)
+    down = norm <= 1e-9 * np.maximum(length, 1e-30)[:, None]
+    return np.where(down, (1.0, 0.0, 0.0, 0.0), half_turn / np.where(down, 1.0, norm))
 
 
 QUADCOPTER = _quadcopter()

@@ -19,7 +19,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import ParallelEnv
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.flocking import FlockingEnv, _checked_config
+from modgnn_rl.envs.flocking import FlockingEnv, checked_config
 from modgnn_rl.errors import InputError
 from modgnn_rl.seeds import derive_seed
 
@@ -98,7 +98,7 @@ def parallel_flocks(
     common = {
         "num_envs": num_envs,
         "num_agents": num_agents,
-        "config": _checked_config(config, settings),
+        "config": checked_config(config, settings),
         "dtype": dtype,
         "stagger": stagger,
     }

@@ -13,6 +13,8 @@ __all__ = ["compiled"]
 Args = ParamSpec("Args")
 Result = TypeVar("Result")
 
+# A product and a sum in one instruction and one rounding: faster by a seventh in the physics.
+OPTIONS: dict[str, Any] = {"cpp.enable_floating_point_contract_flag": "fast"}
 SHAPES = 64  # sets of shapes and settings that one function is compiled for in one process
 
 
@@ -30,7 +32,7 @@ def compiled(function: Callable[Args, Result], enabled: bool = True) -> Callable
         return function
     # Each environment compiles for itself: what one of them was compiled for does not count against the others.
     limits: dict[str, Any] = {"recompile_limit": SHAPES, "isolate_recompiles": True}
-    fast = torch.compile(function, fullgraph=True, dynamic=False, **limits)
+    fast = torch.compile(function, fullgraph=True, dynamic=False, options=OPTIONS, **limits)
     works = True
 
     def run(*args: Args.args, **kwargs: Args.kwargs) -> Result:

@@ -20,7 +20,7 @@ from modgnn_rl.envs import FlockingEnv, TorchPhysics
 from modgnn_rl.envs.leader import NoiseLeader
 from modgnn_rl.envs.rewards import flocking_reward
 from modgnn_rl.errors import InputError
-from modgnn_rl.experts import LocalReynolds, Reynolds
+from modgnn_rl.experts import LocalReynolds, Reynolds, as_matrix
 from modgnn_rl.models import make_model
 from modgnn_rl.settings import check
 
@@ -485,6 +485,14 @@ def test_lists_of_links_are_flown_by_as_the_matrix_is(policy: Any) -> None:
         env.append_transform(policy.make_tensordict_primer())
         flights.append(env.rollout(5, policy)[ACTION])
     torch.testing.assert_close(flights[0], flights[1])
+
+
+@pytest.mark.parametrize("graph", ["matrix", "links"])
+def test_nobody_hears_itself_however_far_it_hears(graph: str) -> None:
+    env = FlockingEnv(2, [3, 5], seed=0, comm_range=math.inf, graph=graph)
+    adjacency = as_matrix(env.reset()["adjacency"], 5)
+    assert not adjacency.diagonal(0, -2, -1).any()
+    assert adjacency.sum((-2, -1)).tolist() == [3 * 2, 5 * 4]
 
 
 # Given states

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+from typing import Any
+
 import gymnasium
 import numpy as np
 import pytest
 
-from modgnn_rl.envs.rendering import Flock, Renderer, check_render_mode
-from modgnn_rl.envs.shapes import ARROW, along, copies, normals, rotations
+from modgnn_rl.envs.rendering import Flock, Renderer
+from modgnn_rl.envs.shapes import ARROW, QUADCOPTER, normals, quaternions_along
 from modgnn_rl.errors import InputError
 
 LEVEL = [0.0, 0.0, 0.0, 1.0]
@@ -83,15 +86,56 @@ def test_pictures_come_from_gymnasium() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("variable", ["DISPLAY", "WAYLAND_DISPLAY"])
-def test_a_window_needs_a_display(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.platform", "linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(InputError, match="needs a display and there is none"):
+def test_a_flight_needs_no_more_memory_than_its_first_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyBullet keeps each shape for ever, so bodies are moved and not made anew."""
+    renderer = Renderer(width=32, height=32)
+    made: list[str] = []
+
+    def count(name: str) -> None:
+        make = getattr(renderer.bullet, name)
+
+        def counted(*args: Any, **options: Any) -> int:
+            made.append(name)
+            return int(make(*args, **options))
+
+        monkeypatch.setattr(renderer.bullet, name, counted)
+
+    count("createVisualShape")
+    count("createMultiBody")
+    renderer.draw(flock(CORNERS, speed=0.9))
+    assert made.count("createVisualShape") == 3  # a leader, a follower, an arrow
+    assert made.count("createMultiBody") == 8
+    renderer.draw(flock([[x + 0.1, y, z] for x, y, z in CORNERS], speed=0.9))
+    renderer.draw(flock(CORNERS[:2]))
+    assert len(made) == 11
+    assert renderer.bullet.getNumBodies(renderer.client) == 2
+    renderer.draw(flock(CORNERS, speed=0.9))
+    assert made[11:] == 6 * ["createMultiBody"]
+    renderer.close()
+
+
+def test_a_picture_does_not_depend_on_those_before_it() -> None:
+    renderer, fresh = (Renderer(width=64, height=48) for _ in range(2))
+    what = flock(CORNERS, speed=0.9, linked=True)
+    expected = fresh.draw(what)
+    for before in (flock(CORNERS[:3], speed=0.3), flock([]), flock([[9.0, 9.0, 9.0], *CORNERS], linked=True)):
+        renderer.draw(before)
+        image = renderer.draw(what)
+        assert image is not None
+        assert expected is not None
+        assert np.array_equal(image, expected)
+    renderer.close()
+    fresh.close()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a display")
+@pytest.mark.parametrize("display", ["", ":4711"])
+def test_a_window_needs_a_display_that_answers(display: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DISPLAY", display)
+    with pytest.raises(InputError, match='needs a display and there is none; use render_mode="rgb_array"'):
         Renderer("human")
-    monkeypatch.setenv(variable, ":0")
-    check_render_mode("human")
+    with pytest.raises(InputError, match="needs a display"):
+        gymnasium.make("modgnn_rl/Flocking-v0", num_agents=2, render_mode="human")
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:
@@ -105,11 +149,16 @@ def test_what_cannot_be_drawn_is_refused() -> None:
         renderer.draw(flock(CORNERS))
 
 
-def test_meshes_are_moved_as_asked() -> None:
-    vectors = np.array([[0.0, 0.0, 2.0], [1.0, 2.0, -2.0], [0.0, 0.0, 0.0]])
-    placed = copies(ARROW, along(vectors, 0.1), np.ones((3, 3))).reshape(3, -1, 3)
-    tip = ARROW.reshape(-1, 3)[:, 2].argmax()
-    assert np.allclose(placed[:, tip], 1 + vectors)
+def test_arrows_point_along_vectors() -> None:
+    vectors = np.array([[0.0, 0.0, 2.0], [1.0, 2.0, -2.0], [0.0, 0.0, -3.0], [1e-4, 0.0, -1.0], [0.0, 0.0, 0.0]])
+    quaternions = quaternions_along(vectors)
+    assert np.allclose(np.linalg.norm(quaternions, axis=-1), 1)
+    for vector, (x, y, z, w) in zip(vectors[:4], quaternions[:4], strict=True):
+        turned = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])  # the z axis
+        assert np.allclose(turned, vector / np.linalg.norm(vector), atol=1e-6)
+
+
+def test_meshes_have_the_size_that_is_scaled() -> None:
+    assert (ARROW[..., 2].min(), ARROW[..., 2].max()) == (0, 1)
+    assert 1 < np.linalg.norm(QUADCOPTER[..., :2], axis=-1).max() < 1.6
     assert np.allclose(np.linalg.norm(normals(ARROW), axis=-1), 1)
-    quarter = rotations(np.array([[0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4)]]))[0]
-    assert np.allclose(quarter @ [1, 0, 0], [0, 1, 0])
