@@ -12,6 +12,7 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation import evaluate, fly, reference_policies
+from modgnn_rl.experts import Reynolds
 from modgnn_rl.table import as_markdown, read_tables, summarise_flights
 
 FLIGHT = {"num_agents": 6, "num_flocks": 4, "steps": 40, "seed": 3}
@@ -52,6 +53,28 @@ def test_all_rows_have_the_same_starts_and_leaders():
         assert torch.equal(first[0], other[0])
         for mine, theirs in zip(first, other, strict=True):
             assert torch.equal(mine[:, 0], theirs[:, 0])
+
+
+def test_a_policy_flies_the_same_in_both_physics():
+    policy = make_model("pair_force", seed=0)
+    torch_flights, bullet_flights = (
+        fly(policy, FlockingConfig(physics=name), **FLIGHT) for name in ("torch", "bullet")
+    )
+    for name in ("error", "leader_distance", "cohesion", "separation", "smallest_distance", "reward"):
+        torch.testing.assert_close(getattr(bullet_flights, name), getattr(torch_flights, name), rtol=1e-3, atol=1e-4)
+    assert torch.equal(bullet_flights.lost, torch_flights.lost)
+
+
+def test_truth_is_measured_where_sensors_are_noisy():
+    quiet, noisy = (
+        fly(Reynolds(action=("agents", "action"), observation=key), config, **FLIGHT)
+        for key, config in (
+            (("agents", "observation"), FlockingConfig()),
+            (("agents", "state"), FlockingConfig(position_noise=0.5)),
+        )
+    )
+    assert torch.equal(quiet.separation, noisy.separation)
+    assert noisy.error.max() == 0
 
 
 def test_quarters_average_to_the_error(flights):
