@@ -1,4 +1,4 @@
-"""The flock for PettingZoo's parallel API: each follower is an agent. Needs the package ``pettingzoo``."""
+"""The flock for PettingZoo's parallel API: each follower is an agent. Needs the extra ``pettingzoo``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from modgnn_rl.errors import InputError
 try:
     from pettingzoo import ParallelEnv
 except ImportError as error:
-    raise InputError("the view for PettingZoo needs the package pettingzoo; install it with pip") from error
+    raise InputError(
+        "the view for PettingZoo needs the package pettingzoo: pip install 'modgnn-rl[pettingzoo]'"
+    ) from error
 
 __all__ = ["PettingZooFlocking", "parallel_env"]
 
