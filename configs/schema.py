@@ -38,7 +38,7 @@ REFERENCE_SIZE = 32  # the flock size to which start_radius, num_envs and receiv
 
 def as_list(value: int | Sequence[int]) -> list[int]:
     """A setting that is one number or a list of them, as a list."""
-    return [value] if isinstance(value, int) else list(value)
+    return list(value) if isinstance(value, Sequence) else [value]
 
 
 @dataclass

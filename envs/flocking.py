@@ -94,9 +94,9 @@ class FlockingEnv(EnvBase):
         self.config = checked_config(config, settings)
         sizes = as_list(self.config.num_agents if num_agents is None else num_agents)
         for name, counts in (("num_envs", [num_envs]), ("num_agents", sizes)):
-            for count in counts:
-                if not isinstance(count, int) or count < 1:
-                    raise InputError(f"{name}={count!r} is not a positive integer")
+            wrong: list[Any] = [count for count in counts if not isinstance(count, int) or count < 1]
+            if wrong or not counts:
+                raise InputError(f"{name}={wrong[0] if wrong else counts} is not a positive integer")
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.dtype = dtype
         self.num_agents = max(sizes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping
 
@@ -116,7 +117,7 @@ def fly(
     closest = torch.full((num_flocks,), torch.inf, device=device)
     diverged = torch.zeros(num_flocks, dtype=torch.bool, device=device)
     tensordict = env.reset()
-    with set_recurrent_mode(False):
+    with contextlib.closing(env), set_recurrent_mode(False):
         for step in range(steps):
             position = tensordict[config.state_key][..., :3]
             tensordict = expert(policy(tensordict))

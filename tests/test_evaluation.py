@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.envs import TorchPhysics
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation import evaluate, fly, reference_policies
 from modgnn_rl.experts import Reynolds
@@ -63,6 +64,14 @@ def test_a_policy_flies_the_same_in_both_physics():
     for name in ("error", "leader_distance", "cohesion", "separation", "smallest_distance", "reward"):
         torch.testing.assert_close(getattr(bullet_flights, name), getattr(torch_flights, name), rtol=1e-3, atol=1e-4)
     assert torch.equal(bullet_flights.lost, torch_flights.lost)
+
+
+def test_flights_leave_no_physics_behind(monkeypatch):
+    """Each flock in PyBullet holds a client until its environment is closed."""
+    closed = []
+    monkeypatch.setattr(TorchPhysics, "close", lambda physics: closed.append(physics))
+    fly(make_model("gcn", seed=0), FlockingConfig(), **FLIGHT)
+    assert len(closed) == 1
 
 
 def test_truth_is_measured_where_sensors_are_noisy():

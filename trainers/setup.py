@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 from modgnn_rl.configs.schema import BCConfig, ImitationConfig, TrainConfig
 from modgnn_rl.dataset import FlightDataset
 from modgnn_rl.envs import FlockingEnv
@@ -44,7 +46,8 @@ def check_training(config: TrainConfig) -> None:
     if not list(make_learner(config, (0, 0)).policy.parameters()):
         raise InputError(f"model.name={config.model.name} with model.hops={config.model.hops} has nothing to learn")
     for size in sizes:
-        FlockingEnv(1, size, config=config.env, seed=config.seed).reset()
+        with contextlib.closing(FlockingEnv(1, size, config=config.env, seed=config.seed)) as env:
+            env.reset()
     if isinstance(settings, BCConfig) and settings.dataset:
         dataset = FlightDataset.open(settings.dataset)
         dataset.check_world(config.env)

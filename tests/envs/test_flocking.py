@@ -590,6 +590,8 @@ def test_padding_touches_nothing() -> None:
         ((2.0,), {}, "num_envs=2.0"),
         ((2, 0), {}, "num_agents=0"),
         ((2, [8, 0]), {}, "num_agents=0"),
+        ((2, 2.5), {}, r"num_agents=2\.5"),
+        ((2, []), {}, r"num_agents=\[\]"),
         ((2, 3), {"collisions": True}, "env.collisions=true needs env.physics=bullet"),
         ((2, 3), {"comm_range": 0.0}, "env.comm_range=0.0 is out of range: it must be greater than 0"),
         ((2, 3), {"comm_range": NAN}, "env.comm_range is not a number"),
