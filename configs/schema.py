@@ -131,6 +131,19 @@ class FlockingConfig:
     collision_distance: float = setting(
         0.08, "two agents closer than this touch (twice the rotor arm), m; costs reward", low=0
     )
+    crowding_distance: float = setting(0.4, "agents closer than this are in each other's way, m; costs reward", above=0)
+    leader_cost: float = setting(0.1, "reward: weight of the distance from the leader, 1/m", low=0)
+    cohesion_cost: float = setting(0.05, "reward: weight of the distance from the flock's centre of mass, 1/m", low=0)
+    crowding_cost: float = setting(
+        1.0, "reward: weight of (1 - d / crowding_distance)^2, d being the distance of the nearest agent", low=0
+    )
+    collision_cost: float = setting(1.0, "reward: weight of touching another agent", low=0)
+    alignment_cost: float = setting(
+        0.1, "reward: weight of the difference of the velocity from the flock's mean velocity, s/m", low=0
+    )
+    effort_cost: float = setting(
+        0.02, "reward: weight of the difference of the target velocity from the velocity, s/m", low=0
+    )
     max_colliding: float = setting(
         0.5, "a flock has collided beyond use when more than this share of its agents touch another", above=0, high=1
     )

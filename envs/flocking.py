@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -19,7 +19,7 @@ from modgnn_rl.envs.leader import make_leader
 from modgnn_rl.envs.physics import Physics, TorchPhysics
 from modgnn_rl.envs.quadcopter import Dynamics
 from modgnn_rl.envs.radio import hear_all_pairs, hear_near_pairs
-from modgnn_rl.envs.rewards import flocking_reward
+from modgnn_rl.envs.rewards import flocking_costs, flocking_reward, reward_weights
 from modgnn_rl.envs.starts import start_positions
 from modgnn_rl.errors import InputError
 from modgnn_rl.metrics import is_diverged
@@ -29,6 +29,7 @@ from modgnn_rl.tensors import clip_to_ball
 
 __all__ = ["FlockingEnv", "checked_config", "make_physics"]
 
+LIMITS = ("max_distance", "max_colliding", "collision_distance", "crowding_distance")
 AWAY = 1e4  # m; where agents that do not exist are kept, as far from each other
 
 
@@ -109,6 +110,8 @@ class FlockingEnv(EnvBase):
         self.target_velocity = torch.zeros(num_envs, self.num_agents, 3, device=self.device, dtype=dtype)
         self.step_count = torch.zeros(num_envs, 1, device=self.device, dtype=torch.long)
         self._hear_all_pairs, self._judge = hear_all_pairs, judge
+        self._weights = reward_weights(self.config)
+        self._limits = {name: float(getattr(self.config, name)) for name in LIMITS}
         self._stagger_next_reset = stagger
         self._make_specs()
         self.group_map = MarlGroupMapType.ALL_IN_ONE_GROUP.get_group_map(
@@ -147,6 +150,11 @@ class FlockingEnv(EnvBase):
         self.full_reward_spec = Composite(agents=Composite(reward=reward, shape=batch), shape=batch)
         done = {name: Binary(shape=(*batch, 1), **flag) for name in ("done", "terminated", "truncated")}
         self.full_done_spec = Composite(**done, shape=batch)
+
+    @property
+    def _nearby(self) -> float:
+        """Distance up to which the nearest agent matters, m."""
+        return max(self.config.collision_distance, self.config.crowding_distance)
 
     @property
     def _room(self) -> int:
@@ -231,10 +239,11 @@ class FlockingEnv(EnvBase):
         self.step_count = self.step_count + 1
 
         position, velocity = self.physics.position, self.physics.velocity
-        adjacency, touching = self._hear(position)
+        adjacency, nearest = self._hear(position)
         exists = self.exists if self.is_mixed else None
-        limits = config.max_distance, config.max_colliding
-        state, reward, terminated = self._judge(position, velocity, touching, self.sizes, exists, limits)
+        state, reward, terminated = self._judge(
+            position, velocity, target, nearest, self.sizes, exists, self._limits, self._weights
+        )
         truncated = self.step_count >= config.max_steps
         return self._emit(state, adjacency).update(
             {
@@ -252,19 +261,19 @@ class FlockingEnv(EnvBase):
         return controlled
 
     def _hear(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """The graph, and the agents that touch another [B, N]."""
+        """The graph, and the distance of the nearest other agent, m [B, N]."""
         config, faults = self.config, self.faults
         taking_part = self.exists & faults.running if self.has_mask else None
         if config.graph == "links":
             if self.is_mixed:
                 position = position.masked_fill(~self.exists.unsqueeze(-1), torch.nan)
-            return hear_near_pairs(position, faults, taking_part, config.collision_distance, self._room)
+            return hear_near_pairs(position, faults, taking_part, self._nearby, self._room)
         reach = config.comm_range if faults.reach is None else faults.reach
-        adjacency, touching = self._hear_all_pairs(position, reach, config.collision_distance)
+        adjacency, nearest = self._hear_all_pairs(position, reach)
         if taking_part is not None:
             adjacency &= taking_part.unsqueeze(-1) & taking_part.unsqueeze(-2)
         arrived = faults.arrived(*adjacency.shape)
-        return adjacency if arrived is None else adjacency & arrived, touching
+        return adjacency if arrived is None else adjacency & arrived, nearest
 
     def _emit(self, state: Tensor, adjacency: Tensor, *, is_new: bool = True) -> TensorDict:
         if self.is_mixed:
@@ -335,29 +344,41 @@ class FlockingEnv(EnvBase):
 def judge(
     position: Tensor,
     velocity: Tensor,
-    touching: Tensor,
+    target_velocity: Tensor,
+    nearest: Tensor,
     sizes: Tensor,
     exists: Tensor | None,
-    limits: tuple[float, float],
+    limits: Mapping[str, float],
+    weights: Mapping[str, float],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """What a step has brought.
 
     Args:
         position: m [B, N, 3].
         velocity: m/s [B, N, 3].
-        touching: agents that touch another, bool [B, N].
+        target_velocity: what the agents were told, m/s [B, N, 3].
+        nearest: distance of the nearest other agent, m [B, N].
         sizes: agents of each flock [B].
         exists: agents that exist, bool [B, N]; default: all.
-        limits: distance from the centre of mass, m, and share of touching agents that end a flight when exceeded.
+        limits: the settings named in `LIMITS`.
+        weights: of the costs, see `modgnn_rl.envs.rewards`.
 
     Returns:
         state [B, N, 6], reward [B, N, 1], and whether the flight is over [B, 1].
     """
-    max_distance, max_colliding = limits
-    colliding = touching.sum(-1) > max_colliding * sizes
-    terminated = (is_diverged(position, max_distance, exists) | colliding).unsqueeze(-1)
-    reward = flocking_reward(position, velocity, touching, exists)
-    return torch.cat((position, velocity), -1), reward, terminated
+    touching = nearest < limits["collision_distance"]
+    colliding = touching.sum(-1) > limits["max_colliding"] * sizes
+    terminated = (is_diverged(position, limits["max_distance"], exists) | colliding).unsqueeze(-1)
+    costs = flocking_costs(
+        position,
+        velocity,
+        target_velocity,
+        nearest,
+        crowding_distance=limits["crowding_distance"],
+        collision_distance=limits["collision_distance"],
+        exists=exists,
+    )
+    return torch.cat((position, velocity), -1), flocking_reward(costs, weights, exists), terminated
 
 
 def checked_config(config: FlockingConfig | None, settings: dict[str, Any]) -> FlockingConfig:

@@ -1,37 +1,85 @@
-"""What flocking is for, as a reward: stay with the leader, move as one, do not collide."""
+"""What flocking is for, as a reward: follow the leader, keep together, keep apart, move as one, with little effort.
+
+It knows nothing of the expert. Each purpose is a cost of its own, zero at best; the reward is their weighted sum below
+zero.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
+from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.tensors import squared_norm
 
-__all__ = ["flocking_reward"]
+__all__ = ["COSTS", "flocking_costs", "flocking_reward", "reward_weights"]
 
-LEADER_WEIGHT = 0.1  # 1/m
-ALIGNMENT_WEIGHT = 0.1  # s/m
-COLLISION_WEIGHT = 1.0
+COSTS = {
+    "leader": "distance from the leader, m",
+    "cohesion": "distance from the flock's centre of mass, m",
+    "crowding": "(1 - d / crowding_distance)^2 where the nearest agent is at d < crowding_distance, else 0",
+    "collision": "1 where the nearest agent is closer than collision_distance, else 0",
+    "alignment": "difference of the velocity from the flock's mean velocity, m/s",
+    "effort": "difference of the target velocity from the velocity, m/s: with k_p, the acceleration asked for",
+}
 
 
-def flocking_reward(position: Tensor, velocity: Tensor, touching: Tensor, exists: Tensor | None = None) -> Tensor:
-    """Reward of each agent for one step; it knows nothing of the expert.
+def reward_weights(config: FlockingConfig) -> dict[str, float]:
+    """The weights ``<name>_cost`` of the costs that count in a world; those of zero are left out."""
+    weights = {name: float(getattr(config, f"{name}_cost")) for name in COSTS}
+    return {name: weight for name, weight in weights.items() if weight}
 
-    ``r_i = -0.1 |p_i - p_leader| - 0.1 |v_i - mean(v)| - 1.0 [i touches another agent]``, the leader being agent 0.
+
+def flocking_costs(
+    position: Tensor,
+    velocity: Tensor,
+    target_velocity: Tensor,
+    nearest: Tensor,
+    *,
+    crowding_distance: float,
+    collision_distance: float,
+    exists: Tensor | None = None,
+) -> dict[str, Tensor]:
+    """All costs of one step, see `COSTS`; the leader is agent 0.
 
     Args:
-        position: m [B, N, 3].
-        velocity: m/s [B, N, 3].
-        touching: agents that collide with another, bool [B, N].
-        exists: agents that exist, bool [B, N]; the others get 0 and do not count in the mean. Default: all.
+        position: m [*B, N, 3].
+        velocity: m/s [*B, N, 3].
+        target_velocity: what the agents were told, m/s [*B, N, 3].
+        nearest: distance of the nearest other agent, m [*B, N]; infinite where there is none.
+        crowding_distance: distance below which agents are in each other's way, m.
+        collision_distance: distance below which they touch, m.
+        exists: agents that exist, bool [*B, N]; the others do not count in means. Default: all.
 
     Returns:
-        reward [B, N, 1].
+        by name [*B, N]; whatever the data for agents that do not exist.
     """
-    leader = _norm(position - position[..., :1, :])
-    mean = velocity.mean(-2, keepdim=True) if exists is None else _mean_of(velocity, exists)
-    alignment = _norm(velocity - mean)
-    reward = -LEADER_WEIGHT * leader - ALIGNMENT_WEIGHT * alignment - COLLISION_WEIGHT * touching.to(position.dtype)
+    return {
+        "leader": _norm(position - position[..., :1, :]),
+        "cohesion": _norm(position - _mean_of(position, exists)),
+        "crowding": (1 - nearest / crowding_distance).clamp(min=0).square(),
+        "collision": (nearest < collision_distance).to(position.dtype),
+        "alignment": _norm(velocity - _mean_of(velocity, exists)),
+        "effort": _norm(target_velocity - velocity),
+    }
+
+
+def flocking_reward(costs: Mapping[str, Tensor], weights: Mapping[str, float], exists: Tensor | None = None) -> Tensor:
+    """Reward of each agent for one step: ``r_i = - sum over the costs c of weight_c cost_c,i``.
+
+    Args:
+        costs: by name [*B, N].
+        weights: by name; costs without one do not count.
+        exists: agents that exist, bool [*B, N]; the others get 0. Default: all.
+
+    Returns:
+        reward [*B, N, 1].
+    """
+    reward = torch.zeros_like(next(iter(costs.values())))
+    for name, weight in weights.items():
+        reward = reward - weight * costs[name]
     return (reward if exists is None else torch.where(exists, reward, 0.0)).unsqueeze(-1)
 
 
@@ -40,7 +88,9 @@ def _norm(vectors: Tensor) -> Tensor:
     return squared_norm(vectors.unbind(-1)).sqrt()
 
 
-def _mean_of(vectors: Tensor, exists: Tensor) -> Tensor:
-    """Mean [B, 1, 3] of the vectors [B, N, 3] of agents that exist."""
+def _mean_of(vectors: Tensor, exists: Tensor | None) -> Tensor:
+    """Mean [*B, 1, 3] of the vectors [*B, N, 3] of agents that exist."""
+    if exists is None:
+        return vectors.mean(-2, keepdim=True)
     there = exists.unsqueeze(-1)
     return torch.where(there, vectors, 0.0).sum(-2, keepdim=True) / there.sum(-2, keepdim=True)

@@ -18,11 +18,12 @@ from modgnn_rl import configs
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv, TorchPhysics
 from modgnn_rl.envs.leader import NoiseLeader
-from modgnn_rl.envs.rewards import flocking_reward
+from modgnn_rl.envs.rewards import flocking_costs, flocking_reward, reward_weights
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import LocalReynolds, Reynolds, as_matrix
 from modgnn_rl.models import make_model
 from modgnn_rl.settings import check
+from modgnn_rl.tensors import pair_distances
 
 NAN = math.nan
 ACTION = ("agents", "action")
@@ -279,16 +280,24 @@ def test_the_range_itself_is_heard() -> None:
 # Rewards and ends
 
 
-def test_reward_is_that_of_the_state_reached() -> None:
-    env = FlockingEnv(2, 3, leader_noise=0.0, collision_distance=0.2)
+@pytest.mark.parametrize("graph", ["matrix", "links"])
+def test_reward_is_that_of_the_state_reached(graph: str) -> None:
+    env = FlockingEnv(2, 3, leader_noise=0.0, collision_distance=0.2, graph=graph)
     td = env.reset()
     place(env, 0, line(0.0, 1.0, 1.1))
     td = act(env, td, 0.5)
     position, velocity = td["next", "agents", "observation"].split(3, -1)
-    touching = torch.zeros(2, 3, dtype=torch.bool)
-    touching[0, 1] = touching[0, 2] = True
+    costs = flocking_costs(
+        position,
+        velocity,
+        env.target_velocity,
+        pair_distances(position).amin(-1),
+        crowding_distance=0.4,
+        collision_distance=0.2,
+    )
+    assert costs["collision"][0].tolist() == [0.0, 1.0, 1.0]
     reward = td["next", "agents", "reward"]
-    torch.testing.assert_close(reward, flocking_reward(position, velocity, touching))
+    torch.testing.assert_close(reward, flocking_reward(costs, reward_weights(env.config)))
     assert float(reward[0, 1]) < -1.0
 
 
