@@ -25,20 +25,33 @@ __all__ = [
     "FlockingConfig",
     "ImitationConfig",
     "LoggerConfig",
+    "MAPPOConfig",
     "ModelConfig",
     "TrainConfig",
+    "TrainerConfig",
     "WorldChanges",
     "as_list",
 ]
 
 
-MODEL_NAMES = ("pair_force", "modgnn_mlp", "no_pre", "no_mid", "gcn", "gcn_final", "central", "gat", "mpnn")
+MODEL_NAMES = (
+    "pair_force",
+    "moment_force",
+    "modgnn_mlp",
+    "no_pre",
+    "no_mid",
+    "gcn",
+    "gcn_final",
+    "central",
+    "gat",
+    "mpnn",
+)
 REFERENCE_SIZE = 32  # the flock size to which start_radius, num_envs and receivers refer
 
 
-def as_list(value: int | Sequence[int]) -> list[int]:
-    """A setting that is one number or a list of them, as a list."""
-    return list(value) if isinstance(value, Sequence) else [value]
+def as_list(value: Any) -> list[Any]:
+    """A setting that is one value or a list of them, as a list."""
+    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
 
 
 @dataclass
@@ -182,36 +195,54 @@ class ModelConfig:
 
     name: str = setting("pair_force", "model", choices=MODEL_NAMES)
     hops: int = setting(1, "communication hops K of each layer", low=0)
-    layers: int = setting(1, "layers; with several, agents hear of others over layers x hops links", low=1)
+    layers: int | None = setting(
+        None, "layers; with several, agents hear of others over layers x hops links; null: the model's own", low=1
+    )
     hidden: int = setting(32, "width of the hidden layers", low=1)
 
 
 @dataclass
-class ImitationConfig:
-    """What behaviour cloning and DAgger share: how flights become data, and data become a policy."""
+class TrainerConfig:
+    """What all trainers share."""
 
-    name: str = setting(MISSING, "trainer", choices=("bc", "dagger"))
+    name: str = setting(MISSING, "trainer", choices=("bc", "dagger", "mappo"))
     num_envs: int = setting(
         32, "flocks of 32 agents flown at once; other sizes get as many agents, shared between the sizes", low=1
     )
-    every: int = setting(2, "of the steps flown, each how-manyth becomes data", low=1)
-    capacity: int = setting(80_000, "flock states kept for each size; the oldest go first", low=1)
-    batch_size: int = setting(256, "flock states in a batch", low=1)
     receivers: int = setting(
         4,
-        "agents of a state of 32 whose error counts in an update; at other sizes N, as many links: 32 / N times",
+        "agents of a state of 32 that count in an update; at other sizes N, as many links: 32 / N times as many agents",
         low=1,
     )
+    averaging: float = setting(0.995, "decay of the moving average of the weights, which is evaluated", low=0, high=1)
+    max_gradient: float = setting(1.0, "gradients are clipped to this norm", above=0)
+    checkpoint_minutes: float = setting(1.0, "time between two checkpoints, min", low=0)
+
+
+@dataclass
+class ImitationConfig(TrainerConfig):
+    """What behaviour cloning and DAgger share: how flights become data, and data become a policy."""
+
+    every: int = setting(2, "of the steps flown, each how-manyth becomes data", low=1)
+    capacity: int = setting(80_000, "flock states kept for each size", low=1)
+    replacement: str = setting(
+        "fifo",
+        "which states go when there is no more room: the oldest, or any, so that all ever seen are kept alike",
+        choices=("fifo", "reservoir"),
+    )
+    batch_size: int = setting(256, "flock states in a batch", low=1)
     learning_rates: list[float] = setting(
         [3e-3, 1e-3, 1e-4],
         "Adam: at the start, after the cloning updates, at the end; cosines between",
         above=0,
         length=3,
     )
-    averaging: float = setting(0.995, "decay of the moving average of the weights, which is what flies", low=0, high=1)
-    max_gradient: float = setting(1.0, "gradients are clipped to this norm", above=0)
-    rotate: bool = setting(True, "turn each state of a batch by a random rotation")
-    checkpoint_minutes: float = setting(1.0, "time between two checkpoints, min", low=0)
+    rotate: bool = setting(
+        True, "turn each state of a batch by a random rotation, unless the model is equivariant and turns with it"
+    )
+    hide_velocity: float = setting(
+        0.0, "share of the states of a batch in which all velocities are hidden", low=0, high=1
+    )
 
 
 @dataclass
@@ -222,6 +253,15 @@ class BCConfig(ImitationConfig):
     cloning_steps: int = setting(1000, "steps that the expert flies", low=1)
     cloning_updates: int = setting(6000, "updates on its flights, shared by the sizes", low=1)
     held_out: int = setting(8, "flocks whose flights are kept for the validation error", low=1)
+    models: Any = setting(
+        None, "models trained side by side on the same batches, a list; null: model.name", choices=MODEL_NAMES
+    )
+    hops: Any = setting(None, "numbers of hops of each of them, a list; null: model.hops", low=0, whole=True)
+    seeds: int = setting(1, "initial weights of each of them, trained side by side", low=1)
+    noise: float = setting(0.0, "standard deviation of the noise in the actions that the expert flies, m/s", low=0)
+    dart: bool = setting(
+        False, "fly in four parts, after each of which the noise becomes the policy's own error (DART)"
+    )
     dataset: str | None = setting(
         None, "folder made by modgnn_rl.collect, whose flights are cloned; null: the expert flies num_envs flocks"
     )
@@ -246,6 +286,48 @@ class DAggerConfig(ImitationConfig):
     share_decay: float = setting(0.6, "exponential schedule: factor between two rounds", low=0, high=1)
     expert_rounds: int = setting(13, "round from which on the policy flies alone", low=0)
     stretch: int = setting(40, "steps that the one who flies a flock keeps it", low=1)
+    gate: str = setting(
+        "none",
+        "let the expert fly a flock where the policy strays: by its disagreement with it, or an ensemble's spread",
+        choices=("none", "disagreement", "ensemble"),
+    )
+    gate_threshold: float = setting(0.6, "disagreement or spread above which the expert flies, m/s", above=0)
+    ensemble: int = setting(3, "gate=ensemble: policies trained side by side, of which the first flies", low=2)
+    plateau_rounds: int = setting(
+        0, "stop when the error of these many rounds is hardly below that of as many before; 0: never", low=0
+    )
+    plateau_gain: float = setting(0.03, "smallest relative improvement that counts", low=0, high=1)
+
+
+@dataclass
+class MAPPOConfig(TrainerConfig):
+    """MAPPO: reinforcement learning from the world's reward, best of a policy that can fly already (``init_from``)."""
+
+    name: str = setting("mappo", "trainer", choices=("mappo",))
+    averaging: float = setting(0.99, "decay of the moving average of the weights, which is evaluated", low=0, high=1)
+    receivers: int = setting(
+        8,
+        "agents of a state of 32 that count in an update; at other sizes N, as many links: 32 / N times as many agents",
+        low=1,
+    )
+    iterations: int = setting(150, "rounds of flying and improving", low=0)
+    round_steps: int = setting(50, "steps flown in a round", low=2)
+    critic_warmup: int = setting(10, "rounds at first in which only the critic learns", low=0)
+    epochs: int = setting(4, "passes over the flights of a round", low=1)
+    batches: int = setting(4, "batches that the flights of a round are split into, for each size", low=1)
+    window: int = setting(10, "steps of the windows from which learned messages are made anew", low=1)
+    noise: float = setting(0.3, "standard deviation of the explored actions at the start, m/s", above=0)
+    discount: float = setting(0.99, "discount of a step", low=0, high=1)
+    trace: float = setting(0.95, "lambda of the advantage estimator (GAE)", low=0, high=1)
+    clip: float = setting(0.2, "probability ratios are clipped to 1 +- this", above=0, high=1)
+    entropy: float = setting(0.0, "weight of the entropy of the actions in the objective", low=0)
+    learning_rate: float = setting(3e-4, "Adam: of the policy", above=0)
+    critic_learning_rate: float = setting(1e-3, "Adam: of the critic", above=0)
+    critic_hidden: int = setting(64, "width of the critic's networks", low=1)
+    anchor: float = setting(
+        0.1, "weight of the divergence (KL) from the policy that training began with, in the first round", low=0
+    )
+    anchor_rounds: int = setting(75, "rounds over which that weight fades to zero; 0: it stays", low=0)
 
 
 @dataclass
@@ -281,6 +363,9 @@ class TrainConfig:
     trainer: Any = MISSING
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    init_from: str | None = setting(
+        None, "run folder whose policy training begins with, and whose model it keeps; null: a fresh one"
+    )
     seed: int = setting(0, "fixes everything that is drawn", low=0, high=2**32)
     device: str = setting("cpu", "where to train: cpu, cuda, cuda:1")
     threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)

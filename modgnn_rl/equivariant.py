@@ -9,9 +9,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-__all__ = ["PairForce", "VectorSquash", "mlp"]
+from modgnn_rl.communication import GraphShift
+
+__all__ = ["Moments", "PairForce", "VectorSquash", "is_equivariant", "mlp"]
 
 VELOCITY_SCALE = 1.4  # s/m
+MANY = 8.0  # sums over about this many neighbours are brought to order one
 
 
 class PairForce(nn.Module):
@@ -32,6 +35,8 @@ class PairForce(nn.Module):
         earlier: number of earlier layers.
         features: (C, S), what each earlier layer puts out.
     """
+
+    is_equivariant = True
 
     def __init__(
         self,
@@ -101,12 +106,56 @@ class PairForce(nn.Module):
         return vectors, scalars
 
 
+class Moments(nn.Module):
+    r"""What a neighbourhood looks like from its middle, without anything to learn: an f_pre that is summed.
+
+    With relative position r u and relative velocity w of each neighbour, five vectors, ``r u``, ``r^2 u``,
+    ``u / (r + 0.3)``, ``w`` and ``r^4 u``, and three scalars, ``1``, ``r`` and ``1 / (r + 0.3)``, brought to order one.
+    The powers of r tell the far from the near: the fourth points to whoever is farthest.
+
+    Behind earlier layers, what these put out is summed, in the same form.
+
+    Args:
+        earlier: number of earlier layers.
+    """
+
+    is_equivariant = True
+    vectors, scalars = 5, 3
+
+    def __init__(self, earlier: int = 0) -> None:
+        super().__init__()
+        self.earlier = earlier
+
+    def forward(self, relative: Tensor) -> Tensor:
+        """Vectors and scalars of links [E, 18].
+
+        Args:
+            relative: sender minus receiver, one step old: position, m, velocity, m/s, outputs of earlier layers [E, F].
+        """
+        if self.earlier:
+            return relative[..., -(3 * self.vectors + self.scalars) :] / MANY
+        offset, drift = relative[..., :6].movedim(-1, 0).contiguous().split(3)
+        distance = _norm(offset)
+        nearness = 1 / (distance + 0.3)
+        vectors = [
+            offset / MANY,
+            offset * (distance / (2 * MANY)),
+            offset * (2 * nearness / (distance * MANY)),
+            drift * (2 / MANY),
+            offset * (distance**3 / (8 * MANY)),
+        ]
+        scalars = torch.stack([torch.ones_like(distance), distance / 2, nearness]) / MANY
+        return torch.cat([*vectors, scalars]).movedim(0, -1)
+
+
 class VectorSquash(nn.Module):
     """Bring vectors and scalars of any size to order one, equivariantly: ``x / (1 + |x|)`` each.
 
     Args:
         vectors: number of vectors V; scalars follow them.
     """
+
+    is_equivariant = True
 
     def __init__(self, vectors: int) -> None:
         super().__init__()
@@ -117,6 +166,17 @@ class VectorSquash(nn.Module):
         vectors, scalars = data[..., : 3 * self.vectors].unflatten(-1, (-1, 3)), data[..., 3 * self.vectors :]
         length = (vectors.square().sum(-1, keepdim=True) + 1e-8).sqrt()
         return torch.cat(((vectors / (1 + length)).flatten(-2), scalars / (1 + scalars.abs())), -1)
+
+
+def is_equivariant(module: nn.Module) -> bool:
+    """Whether a policy is known to turn with the world: all that its layers are made of says ``is_equivariant``."""
+    parts = [part for part in module.modules() if not list(part.children())]
+    inside = {part for holder in module.modules() if _says_so(holder) for part in holder.modules()}
+    return all(part in inside or isinstance(part, (nn.Identity, GraphShift)) for part in parts)
+
+
+def _says_so(module: nn.Module) -> bool:
+    return bool(getattr(module, "is_equivariant", False))
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Mapping
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.modules import get_primers_from_module, set_recurrent_mode
@@ -64,16 +64,28 @@ class Flights:
     diverged: Tensor
 
 
-def reference_policies(config: FlockingConfig) -> dict[str, TensorDictModuleBase]:
-    """The rows that every table has: the expert, the expert with a policy's eyes, and doing nothing."""
+def reference_policies(
+    config: FlockingConfig, expert: TensorDictModuleBase | None = None
+) -> dict[str, TensorDictModuleBase]:
+    """The rows that every table has: the expert, the expert with a policy's eyes, and doing nothing.
+
+    Of an expert of one's own, only it and doing nothing.
+    """
     key = ("agents", "action")
     idle = TensorDictModule(_zero_action, in_keys=[("agents", "observation")], out_keys=[key])
+    if expert is not None:
+        fly_it = TensorDictModule(_as_it_is, in_keys=expert.out_keys[:1], out_keys=[key])
+        return {"expert": TensorDictSequential(expert, fly_it), "zero action": idle}
     return {
         "expert": Reynolds.for_env(config, action=key),
         "LocalReynolds(hops=2)": LocalReynolds.for_env(config, hops=2, action=key),
         "LocalReynolds(hops=1)": LocalReynolds.for_env(config, hops=1, action=key),
         "zero action": idle,
     }
+
+
+def _as_it_is(action: Tensor) -> Tensor:
+    return action.clone()
 
 
 def _zero_action(observation: Tensor) -> Tensor:
@@ -91,6 +103,7 @@ def fly(
     seed: int,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
+    expert: TensorDictModuleBase | None = None,
 ) -> Flights:
     """Fly fresh flocks with a policy to the end of the episode and measure them.
 
@@ -106,12 +119,13 @@ def fly(
         seed: seed of starts and leaders.
         device: where to fly.
         progress: counts flock-steps.
+        expert: what errors are measured against, writes ``("agents", "expert_action")``; default: Reynolds flocking.
     """
     world = dataclasses.replace(config, max_distance=torch.inf, max_colliding=1.0, max_steps=steps)
     base = FlockingEnv(num_flocks, num_agents, config=world, seed=seed, device=device)
     primers = get_primers_from_module(policy, warn=False)
     env = TransformedEnv(base, Compose(InitTracker(), *([primers] if primers is not None else [])))
-    expert = Reynolds.for_env(config)
+    expert = expert or Reynolds.for_env(config)
     means = _Means(num_flocks, device)
     quarters = torch.zeros(num_flocks, QUARTERS, device=device)
     closest = torch.full((num_flocks,), torch.inf, device=device)
@@ -184,9 +198,13 @@ def evaluate(
     steps: int,
     seed: int,
     device: torch.device | str = "cpu",
+    expert: TensorDictModuleBase | None = None,
 ) -> dict[str, Flights]:
-    """Fly each policy, and the reference policies, from the same starts; progress is shown. See `fly`."""
-    policies = {**policies, **reference_policies(config)}
+    """Fly each policy, and the reference policies, from the same starts; progress is shown. See `fly`.
+
+    With an expert of one's own, the reference is it and doing nothing.
+    """
+    policies = {**policies, **reference_policies(config, expert)}
     total = len(policies) * num_flocks * steps
     flights = {}
     with Progress(f"evaluate, {num_agents} agents", total) as progress:
@@ -201,5 +219,6 @@ def evaluate(
                 seed=seed,
                 device=device,
                 progress=progress,
+                expert=expert,
             )
     return flights

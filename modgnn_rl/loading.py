@@ -18,7 +18,7 @@ from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.settings import check
 
-__all__ = ["load_policy", "stored_world"]
+__all__ = ["load_policy", "stored_model", "stored_world"]
 
 
 def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu") -> ModGNN:
@@ -35,7 +35,7 @@ def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = 
         InputError: the folder holds no run, no readable checkpoint, or one of another model.
     """
     run = RunFolder.open(Path(folder))
-    model = _stored(run, "model", ModelConfig)
+    model = stored_model(run)
     policy = configured_model(model, stored_world(run), seed=0)
     checkpoint = load_checkpoint(run.checkpoints)
     try:
@@ -46,6 +46,16 @@ def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = 
             "restore the folder as training wrote it"
         ) from error
     return policy.to(device).eval()
+
+
+def stored_model(run: RunFolder) -> ModelConfig:
+    """The model that a run trained.
+
+    Raises:
+        InputError: its configuration does not describe one.
+    """
+    model: ModelConfig = _stored(run, "model", ModelConfig)
+    return model
 
 
 def stored_world(run: RunFolder) -> FlockingConfig:

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from modgnn_rl.central import CentralLayer
 from modgnn_rl.communication import GraphAttention, MessagePassing
 from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
-from modgnn_rl.equivariant import VELOCITY_SCALE, PairForce, VectorSquash, mlp
+from modgnn_rl.equivariant import VELOCITY_SCALE, Moments, PairForce, VectorSquash, mlp
 from modgnn_rl.errors import InputError
 from modgnn_rl.modgnn import ModGNN, ModGNNLayer
 from modgnn_rl.settings import suggestion
@@ -73,6 +73,8 @@ class LayerSpec(NamedTuple):
 class BallHead(nn.Module):
     """Projection onto the ball of allowed actions: what the environment and the expert do to theirs."""
 
+    is_equivariant = True
+
     def __init__(self, max_speed: float) -> None:
         super().__init__()
         self.max_speed = max_speed
@@ -123,6 +125,8 @@ class Relative(nn.Module):
 
 class Zero(nn.Module):
     """A hop that contributes nothing: zeros of a given width."""
+
+    is_equivariant = True
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -211,11 +215,26 @@ def pair_force(spec: LayerSpec) -> ModGNNLayer:
     Layers before the last put out four vectors and four scalars, which later layers compare like velocities.
     """
     vectors, scalars = (VECTORS, SCALARS) if spec.head is None else (1, 0)
-    f_pre: list[nn.Module] = [Zero(spec.outputs)]
+    return _sum_of_forces(spec, vectors, scalars, features=(VECTORS, SCALARS))
+
+
+def moment_force(spec: LayerSpec) -> ModGNNLayer:
+    """`pair_force` over what the neighbours' own neighbourhoods look like: `Moments` in the layers before the last.
+
+    These have nothing to learn, so that an agent sees two links far and training costs little more than with one.
+    """
+    features = Moments.vectors, Moments.scalars
+    if spec.head is not None:
+        return _sum_of_forces(spec, 1, 0, features)
+    f_pre = [Zero(3 * Moments.vectors + Moments.scalars), *(Moments(spec.earlier) for _ in range(spec.hops))]
+    return ModGNNLayer(spec.hops, f_pre=f_pre, f_final=VectorSquash(Moments.vectors))
+
+
+def _sum_of_forces(spec: LayerSpec, vectors: int, scalars: int, features: tuple[int, int]) -> ModGNNLayer:
+    """A layer of `PairForce` in each hop, behind layers that put out ``features``."""
+    f_pre: list[nn.Module] = [Zero(3 * vectors + scalars)]
     for _ in range(spec.hops):
-        force = PairForce(
-            spec.hidden, vectors=vectors, scalars=scalars, earlier=spec.earlier, features=(VECTORS, SCALARS)
-        )
+        force = PairForce(spec.hidden, vectors=vectors, scalars=scalars, earlier=spec.earlier, features=features)
         f_pre.append(TensorDictModule(force, in_keys=["data", "input"], out_keys=["data"]))
     f_final = VectorSquash(vectors) if spec.head is None else spec.head
     return ModGNNLayer(spec.hops, f_pre=f_pre, f_final=f_final)
@@ -223,6 +242,7 @@ def pair_force(spec: LayerSpec) -> ModGNNLayer:
 
 MODELS: dict[str, Callable[[LayerSpec], ModGNNLayer | CentralLayer]] = {
     "pair_force": pair_force,
+    "moment_force": moment_force,
     "modgnn_mlp": modgnn_mlp,
     "no_pre": no_pre,
     "no_mid": no_mid,
@@ -234,12 +254,15 @@ MODELS: dict[str, Callable[[LayerSpec], ModGNNLayer | CentralLayer]] = {
 }
 
 
+LAYERS = {"moment_force": 2}  # of models that have not one
+
+
 def make_model(
     name: str,
     hops: int = 1,
     hidden: int = 32,
     *,
-    layers: int = 1,
+    layers: int | None = None,
     max_speed: float = 0.92,
     num_agents: int | None = None,
     seed: int | None = None,
@@ -252,6 +275,7 @@ def make_model(
         hops: number of communication hops K, of each layer.
         hidden: width of the hidden layers.
         layers: number of layers L; with several, an agent hears of others over L K links, one step late for each.
+            Default: 2 for ``moment_force``, 1 for the others.
         max_speed: radius of the action ball, m/s.
         num_agents: number of agents, which only ``central`` needs to know.
         seed: seed of the initial weights; default: torch's global generator as it stands.
@@ -265,6 +289,8 @@ def make_model(
     """
     if name not in MODELS:
         raise InputError(f"model '{name}' is not one of {', '.join(MODELS)}{suggestion(name, MODELS)}")
+    if layers is None:
+        layers = LAYERS.get(name, 1)
     if not isinstance(layers, int) or layers < 1:
         raise InputError(f"layers={layers!r} is not a number of layers; expected an integer of at least 1")
     with torch.random.fork_rng(devices=[], enabled=seed is not None):

@@ -111,8 +111,10 @@ class ModGNN(TensorDictModuleBase):
 
     @property
     def sends_plain_data(self) -> bool:
-        """Whether messages are sums of observations, so that stored ones stay exact while the policy learns."""
-        return len(self.layers) == 1 and self.layers[0].sends_plain_data
+        """Whether messages hold no trace of a parameter, so that stored ones stay exact while the policy learns."""
+        *earlier, last = self.layers
+        fixed = all(layer.sends_plain_data and not any(True for _ in layer.parameters()) for layer in earlier)
+        return fixed and last.sends_plain_data
 
     @property
     def num_parameters(self) -> int:

@@ -79,6 +79,20 @@ class RunFolder:
         return cls.open(path)
 
     @classmethod
+    def create_inside(cls, parent: RunFolder, name: str, config_yaml: str) -> RunFolder:
+        """Make a folder for one of several policies of a run, inside that run's folder.
+
+        Args:
+            parent: the run.
+            name: of the folder.
+            config_yaml: the policy's own settings.
+        """
+        path = parent.path / name
+        path.mkdir(exist_ok=True)
+        write_atomically(path / "config.yaml", f"{_HEADER}schema_version: {SCHEMA_VERSION}\n{config_yaml}")
+        return cls.open(path)
+
+    @classmethod
     def open(cls, path: str | os.PathLike[str]) -> RunFolder:
         """Open the folder of an earlier run.
 

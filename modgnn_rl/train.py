@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 
 from modgnn_rl.command import run_command
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, TrainConfig
+from modgnn_rl.configs.schema import BCConfig, DAggerConfig, MAPPOConfig, TrainConfig
 
 
 def main(config: TrainConfig) -> None:
@@ -18,4 +18,9 @@ def main(config: TrainConfig) -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, TrainConfig, "train", nodes={"trainer/dagger": DAggerConfig, "trainer/bc": BCConfig})
+    run_command(
+        main,
+        TrainConfig,
+        "train",
+        nodes={"trainer/dagger": DAggerConfig, "trainer/bc": BCConfig, "trainer/mappo": MAPPOConfig},
+    )

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
 from modgnn_rl.errors import InputError
@@ -22,16 +24,26 @@ from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.settings import check
 from modgnn_rl.table import as_markdown, read_tables, summarise_flights
 from modgnn_rl.trainers.bc import bc
+from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.dagger import dagger
-from modgnn_rl.trainers.setup import check_training
+from modgnn_rl.trainers.mappo import mappo
+from modgnn_rl.trainers.setup import check_training, settle_model
 
-__all__ = ["TRAINERS", "evaluate_policy", "evaluate_run", "prepare_torch", "train"]
+__all__ = ["TRAINERS", "evaluate_policies", "evaluate_run", "prepare_torch", "train"]
 
-TRAINERS = {"bc": bc, "dagger": dagger}
+TRAINERS = {"bc": bc, "dagger": dagger, "mappo": mappo}
 
 
-def train(config: TrainConfig) -> RunFolder:
+def train(
+    config: TrainConfig, *, expert: TensorDictModuleBase | None = None, callbacks: Sequence[Callback] = ()
+) -> RunFolder:
     """Train a policy, evaluate it, and leave everything in a new run folder.
+
+    Args:
+        config: all settings.
+        expert: whom to learn from: any TensorDictModule that reads the environment's keys and writes
+            ``("agents", "expert_action")``; default: Reynolds flocking. Errors in the evaluation are against it too.
+        callbacks: people's own code, see `modgnn_rl.trainers.callbacks`.
 
     Raises:
         InputError: a bad setting, or a device or a logger that this machine does not have; nothing is created then.
@@ -39,15 +51,16 @@ def train(config: TrainConfig) -> RunFolder:
     check(config)
     prepare_torch(config.device, config.threads)
     check_logger(config.logger)
+    config = settle_model(config)
     check_training(config)
     name = config.name or f"{config.trainer.name}-{config.model.name}"
     run = RunFolder.create(config.runs, name, OmegaConf.to_yaml(OmegaConf.structured(config)))
     print(f"Training in {run.path}", flush=True)
     logger = make_logger(config.logger, run)
     try:
-        policy = TRAINERS[config.trainer.name](config, run, logger)
+        policies = TRAINERS[config.trainer.name](config, run, logger, expert=expert, callbacks=callbacks)
         sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
-        tables = evaluate_policy(run, policy, config.env, config.evaluation, sizes, config.device)
+        tables = evaluate_policies(run, policies, config.env, config.evaluation, sizes, config.device, expert=expert)
         errors = {
             f"evaluation/{size}/{row}/error": figures["error"]["mean"]
             for size, table in tables.items()
@@ -65,16 +78,17 @@ def train(config: TrainConfig) -> RunFolder:
     return run
 
 
-def evaluate_policy(
+def evaluate_policies(
     run: RunFolder,
-    policy: ModGNN,
+    policies: Mapping[str, ModGNN],
     world: FlockingConfig,
     settings: EvaluationConfig,
     sizes: list[int],
     device: str,
     changes: str = "",
+    expert: TensorDictModuleBase | None = None,
 ) -> dict[int, dict[str, Any]]:
-    """Fly a run's policy and the reference policies, and write the table of each size into the run folder.
+    """Fly a run's policies and the reference policies, and write the table of each size into the run folder.
 
     Tables of other sizes that the folder holds already are kept; a world changed since training has files of its own.
 
@@ -84,13 +98,14 @@ def evaluate_policy(
     tables = {}
     for size in sizes:
         flights = evaluate(
-            {run.config["model"]["name"]: policy},
+            policies,
             world,
             num_agents=size,
             num_flocks=settings.num_flocks,
             steps=settings.steps,
             seed=settings.seed,
             device=device,
+            expert=expert,
         )
         tables[size] = summarise_flights(flights, settings.seed)
     flown = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
@@ -134,7 +149,7 @@ def evaluate_run(config: EvaluateConfig) -> Path:
         raise InputError(f"env.{error.full_key}: {str(error.msg).splitlines()[0]}") from error
     sizes = as_list(config.evaluation.num_agents or world.num_agents)
     named = ",".join(f"{name}={value}" for name, value in sorted(changes.items()))
-    evaluate_policy(run, policy, world, config.evaluation, sizes, config.device, named)
+    evaluate_policies(run, {run.config["model"]["name"]: policy}, world, config.evaluation, sizes, config.device, named)
     return evaluation_file(run, named)
 
 

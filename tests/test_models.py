@@ -161,6 +161,7 @@ def test_counts_of_parameters(hops: int, hidden: int) -> None:
         "gat": attention + (hops - 1) * later_attention + mlp(6, 10) + hops * mlp(hidden, 10) + final,
         "mpnn": mlp(9, hidden) + (hops - 1) * mlp(2 * hidden, hidden) + mlp(6, 10) + hops * mlp(hidden, 10) + final,
         "pair_force": hops * mlp(7, 3),
+        "moment_force": hops * mlp(53, 13),  # of ten vectors and six scalars, sender's and receiver's, beside those
     }
     assert {name: build(name, hops, hidden=hidden).num_parameters for name in MODELS} == expected
 
@@ -170,7 +171,7 @@ def test_the_table_of_models_in_the_documentation_is_true() -> None:
     rows = re.findall(r"^\| `(\w+)`(, two layers)? \|[^|]*\| ([\d,]+) \| ([\d,]+) \| ([\d,]+) \|$", page, re.MULTILINE)
     assert {name for name, *_ in rows} == set(MODELS)
     for name, two_layers, *counts in rows:
-        models = [make_model(name, hops, layers=2 if two_layers else 1, num_agents=32) for hops in (1, 2, 3)]
+        models = [make_model(name, hops, layers=2 if two_layers else None, num_agents=32) for hops in (1, 2, 3)]
         assert [f"{model.num_parameters:,}" for model in models] == counts, name
 
 
@@ -251,7 +252,7 @@ def test_central_serves_one_number_of_agents_and_says_so() -> None:
         configured_model(ModelConfig(name="central"), FlockingConfig(num_agents=[8, 16]), seed=0)
 
 
-@pytest.mark.parametrize("layers", [0, 1.5, None])
+@pytest.mark.parametrize("layers", [0, 1.5, "2"])
 def test_layers_must_be_counted(layers: Any) -> None:
     with pytest.raises(InputError, match="layers="):
         make_model("gcn", layers=layers)

@@ -71,7 +71,10 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
 def test_a_checkpoint_holds_what_a_run_is_made_of(run):
     checkpoint = load_checkpoint(run.checkpoints)
     assert set(checkpoint.tensors) == {"policy", "trained", "optimizer", "generators"}
-    assert set(checkpoint.tensors["generators"]) == {"learner", "5.env", "5.faults", "5.mixture", "5.batches"}
+    assert set(checkpoint.tensors["generators"]) == {
+        "learner",
+        *(f"0.5.{name}" for name in ("env", "faults", "noise", "mixture", "disturbance", "batches")),
+    }
     assert checkpoint.state["config"] == run.config
     assert checkpoint.state["updates"] == checkpoint.state["averaged"] == checkpoint.step == 10
 

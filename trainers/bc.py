@@ -3,80 +3,143 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
+from omegaconf import OmegaConf
+from tensordict.nn import TensorDictModuleBase
 from torchrl.data import ReplayBuffer
 
+from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
 from modgnn_rl.dataset import FlightDataset
+from modgnn_rl.evaluation import fly
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.loggers import GuardedLogger
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.seeds import derive_seed
+from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.collection import Flocks, flocks_of_all_sizes
-from modgnn_rl.trainers.journal import Journal, flight_metrics
-from modgnn_rl.trainers.setup import make_learner
+from modgnn_rl.trainers.journal import Journal
+from modgnn_rl.trainers.learner import fit_together, validate_together
+from modgnn_rl.trainers.setup import make_learner, side_by_side
 
 __all__ = ["bc"]
 
 ROUNDS = 40  # parts of the training after each of which the loss is looked at
-FLIGHT_ROUNDS = 20  # parts after which the policy flies
+FLIGHT_ROUNDS = 20  # parts after which the policies fly
+FLIGHT_STEPS = 250  # how long
+DART_PARTS = 4  # parts of the flights between which the noise is set anew
 
 
-def bc(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN:
-    """Train a policy by behaviour cloning.
+def bc(
+    config: TrainConfig,
+    run: RunFolder,
+    logger: GuardedLogger,
+    *,
+    expert: TensorDictModuleBase | None = None,
+    callbacks: Sequence[Callback] = (),
+) -> dict[str, ModGNN]:
+    """Train policies by behaviour cloning, one or several side by side on the same batches.
 
     The expert's flights come from a dataset, or are flown first. The validation error is taken on flights that are not
-    trained on. It says little of how the policy flies: it never meets the states that its own errors lead to.
+    trained on. It says little of how a policy flies: it never meets the states that its own errors lead to.
 
     Args:
         config: the run's settings, ``config.trainer`` being a `BCConfig`.
-        run: the folder to leave metrics and checkpoints in.
+        run: the folder to leave metrics and checkpoints in; with several policies, a run folder of each lies in it.
         logger: the dashboard.
+        expert: writes ``("agents", "expert_action")``; default: Reynolds flocking.
+        callbacks: people's own code.
 
     Returns:
-        the trained policy: the moving average of the weights.
+        the trained policies, the moving averages of the weights, by name.
     """
     settings: BCConfig = config.trainer
     sizes = config.env.sizes
     rounds = min(ROUNDS, settings.cloning_updates // len(sizes))
     fitting = settings.cloning_updates // (rounds * len(sizes))
     updates = rounds * fitting * len(sizes)
-    learner = make_learner(config, (updates, updates))
-    expert = Reynolds.for_env(config.env)
-    flown = {"steps": settings.cloning_steps, "stretch": settings.cloning_steps}
+    members = side_by_side(config)
+    by_name = {name: make_learner(member, (updates, updates)) for name, member in members.items()}
+    learners, policies = list(by_name.values()), [learner.flown for learner in by_name.values()]
+    expert = expert or Reynolds.for_env(config.env)
+    parts = DART_PARTS if settings.dart else 1
+    flown: dict[str, Any] = {"steps": max(1, settings.cloning_steps // parts), "stretch": settings.cloning_steps}
     held_out = dataclasses.replace(settings, num_envs=settings.held_out)
-    validation = flocks_of_all_sizes(
-        dataclasses.replace(config, trainer=held_out, seed=derive_seed(config.seed, "validation")),
-        learner.flown,
-        expert,
-        **flown,
-    )
-    training = [] if settings.dataset else flocks_of_all_sizes(config, learner.flown, expert, **flown)
+    unseen_config = dataclasses.replace(config, trainer=held_out, seed=derive_seed(config.seed, "validation"))
+    validation = flocks_of_all_sizes(unseen_config, policies, expert, **flown)
+    training = [] if settings.dataset else flocks_of_all_sizes(config, policies, expert, **flown)
+    noise = settings.noise
 
-    with Journal(run, logger, learner, [*training, *validation], updates, settings) as journal:
+    with Journal(run, logger, by_name, [*training, *validation], updates, settings, callbacks) as journal:
         if settings.dataset:
-            buffers = [_share(settings.dataset, settings, validation[0], learner.flown.window)]
+            buffers = [_share(settings.dataset, settings, validation[0], max(policy.window for policy in policies))]
         else:
-            for group in (*training, *validation):
-                group.keep(group.fly(expert_share=1.0))
+            for group in validation:
+                for _ in range(parts):
+                    group.keep(group.fly(expert_share=1.0))
             buffers = [group.buffer for group in training]
         for index in range(rounds):
-            metrics = {"learning_rate": learner.learning_rate}
+            if training and index % -(-rounds // parts) == 0:
+                for group in training:
+                    group.disturbance.scale = noise
+                    group.keep(journal.show(index, group.fly(expert_share=1.0)))
+            metrics = {"learning_rate": learners[0].learning_rate, "noise": noise}
+            losses = []
             for buffer, unseen in zip(buffers, validation, strict=True):
-                metrics[f"{unseen.num_agents}/loss"] = learner.fit(buffer, fitting)
-                metrics[f"{unseen.num_agents}/validation_loss"] = learner.validate(unseen.buffer)
+                found = {
+                    "loss": fit_together(learners, buffer, fitting),
+                    "validation_loss": validate_together(learners, unseen.buffer),
+                }
+                losses += found["validation_loss"]
+                for name, values in found.items():
+                    metrics |= _named(by_name, f"{unseen.num_agents}/{name}", values)
                 if (index + 1) % FLIGHT_ROUNDS == 0:
-                    metrics |= flight_metrics(unseen.fly(expert_share=0.0), config.env)
-            loss = sum(metrics[f"{size}/validation_loss"] for size in sizes) / len(sizes)
-            journal.note(index + 1, metrics, fitting * len(sizes), validation_loss=loss)
+                    metrics |= _errors_in_flight(config, by_name, unseen.num_agents)
+            loss = sum(losses) / len(losses)
+            noise = loss**0.5 if settings.dart else noise
+            if journal.note(index + 1, metrics, fitting * len(sizes), validation_loss=loss):
+                break
 
-    return learner.flown
+    if len(members) > 1:
+        for name, member in members.items():
+            own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
+            save_checkpoint(own.checkpoints, updates, {"policy": by_name[name].flown.state_dict()}, {})
+    return dict(zip(by_name, policies, strict=True))
+
+
+def _named(by_name: dict[str, Any], metric: str, values: Sequence[float]) -> dict[str, float]:
+    """One metric of each policy; if there are several, it begins with the policy's name."""
+    if len(by_name) == 1:
+        return {metric: values[0]}
+    return {f"{name}/{metric}": value for name, value in zip(by_name, values, strict=True)}
+
+
+def _errors_in_flight(config: TrainConfig, by_name: dict[str, Any], size: int) -> dict[str, float]:
+    """The error of each policy on short flights of its own, from the same starts."""
+    settings: BCConfig = config.trainer
+    flights = [
+        fly(
+            learner.flown,
+            config.env,
+            num_agents=size,
+            num_flocks=settings.held_out,
+            steps=min(FLIGHT_STEPS, settings.cloning_steps),
+            seed=derive_seed(config.seed, "validation"),
+            device=config.device,
+        )
+        for learner in by_name.values()
+    ]
+    return _named(by_name, f"{size}/error", [float(flight.error.mean()) for flight in flights])
 
 
 def _share(path: str, settings: BCConfig, unseen: Flocks, window: int) -> ReplayBuffer:
-    """Share a dataset's flights: the last ``held_out`` become the data of ``unseen``, the others are returned."""
+    """Share a dataset's flights: the last ``held_out`` become the data of ``unseen``, the others are returned.
+
+    A dataset holds no messages: windows make them anew.
+    """
     dataset = FlightDataset.open(path, verify=False, device=unseen.env.device)  # `check_training` has verified it
     seen = dataset.episodes - settings.held_out
     draws: dict[str, Any] = {

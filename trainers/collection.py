@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -12,30 +12,111 @@ from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRo
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, ImitationConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.equivariant import is_equivariant
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.seeds import derive_seed
-from modgnn_rl.trainers.mixing import Mixture
+from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture, SafetyGate, spread
 
-__all__ = ["Flocks", "as_windows", "flocks_of_all_sizes"]
+__all__ = [
+    "FlockCollector",
+    "Flocks",
+    "as_windows",
+    "flocks_of",
+    "flocks_of_all_sizes",
+    "reservoir_places",
+    "stores_messages",
+    "window_of",
+]
 
 
-class Flocks:
-    """Flocks of one size, flown by a mixture of policy and expert through TorchRL's `Collector`, and their data.
+class FlockCollector:
+    """Flocks of one size that never stop flying, flown through TorchRL's `Collector`.
 
-    Each call of `fly` continues the flights where they were; `keep` adds windows of them to the replay buffer, and when
-    that is full, the oldest go.
+    Each call of `fly` continues the flights where they were.
+
+    Args:
+        config: the world.
+        num_envs: flocks flown at once, B.
+        num_agents: agents in each, N.
+        behaviour: the modules that fly and label, in this order (weights changed in place are flown at once).
+        steps: steps of one call of `fly`.
+        seed: seeds the environment, and the draws of modules that draw from torch's global generator.
+        device: where flocks and data live.
+    """
+
+    def __init__(
+        self,
+        config: FlockingConfig,
+        num_envs: int,
+        num_agents: int,
+        behaviour: Sequence[TensorDictModuleBase],
+        *,
+        steps: int,
+        seed: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.num_agents = num_agents
+        self.env = FlockingEnv(
+            num_envs, num_agents, config=config, seed=derive_seed(seed, "env"), device=device, stagger=True
+        )
+        self.noise = torch.Generator().manual_seed(derive_seed(seed, "noise"))
+        self.collector = Collector(
+            self.env,
+            TensorDictSequential(*behaviour),
+            frames_per_batch=num_envs * steps,
+            total_frames=-1,
+            auto_register_policy_transforms=True,
+            trust_policy=True,
+            no_cuda_sync=True,
+        )
+        self._flights: Iterator[TensorDictBase] = iter(self.collector)
+
+    @torch.no_grad()
+    def continue_flights(self) -> TensorDictBase:
+        """Continue the flights by some steps; flights [B, T]. Torch's global generators are left as they were."""
+        seed = int(torch.randint(2**31, (), generator=self.noise))
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            return next(self._flights)
+
+    @property
+    def generators(self) -> dict[str, torch.Generator]:
+        """All that draws at random here, by name."""
+        return {
+            f"{self.num_agents}.env": self.env.generator,
+            f"{self.num_agents}.faults": self.env.faults.generator,
+            f"{self.num_agents}.noise": self.noise,
+        }
+
+    def close(self) -> None:
+        """End the flights."""
+        self.collector.shutdown()
+
+
+class Flocks(FlockCollector):
+    """Flocks of one size, flown by a mixture of policy and expert, and their data.
+
+    `keep` adds windows of flights to the replay buffer.
 
     Args:
         config: the world.
         settings: how flights become data.
         num_envs: flocks flown at once, B.
         num_agents: agents in each, N.
-        policy: the policy that flies (weights changed in place are flown at once).
+        policies: those that learn from the data; the first flies beside the expert (weights changed in place are flown
+            at once), all of them if there is a gate that looks at their spread.
         expert: writes ``("agents", "expert_action")``.
         steps: steps of one call of `fly`.
         stretch: steps that the one who flies a flock keeps it.
+        gate: lets the expert fly where the policy strays.
         seed: seeds the environment, the mixture and the sampling of batches.
         device: where flocks and data live.
+
+    Attributes:
+        window: steps of a window of the data.
+        mixture, disturbance: who flies, and how it is disturbed.
+        buffer: the data.
+        seen: windows that were ever added.
     """
 
     def __init__(
@@ -44,36 +125,29 @@ class Flocks:
         settings: ImitationConfig,
         num_envs: int,
         num_agents: int,
-        policy: ModGNN,
+        policies: Sequence[ModGNN],
         expert: TensorDictModuleBase,
         *,
         steps: int,
         stretch: int,
+        gate: SafetyGate | None = None,
         seed: int,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.num_agents = num_agents
-        self.every = settings.every
-        # Messages that hold no trace of a parameter are stored; others are made anew from a window.
-        self.window = 1 if policy.sends_plain_data else policy.window
-        self.keys = {*policy.in_keys, ("agents", "controlled"), *expert.out_keys[:1]}
+        self.settings = settings
+        self.window = window_of(policies, settings)
+        self.keys = {*(key for policy in policies for key in policy.in_keys), ("agents", "controlled")}
+        self.keys |= {*expert.out_keys[:1]}
         if self.window > 1:
-            self.keys -= {policy.messages_key}
+            self.keys -= {policy.messages_key for policy in policies}
         self.mixture = Mixture(1.0, stretch, torch.Generator().manual_seed(derive_seed(seed, "mixture")))
-        self.env = FlockingEnv(
-            num_envs, num_agents, config=config, seed=derive_seed(seed, "env"), device=device, stagger=True
-        )
-        self.collector = Collector(
-            self.env,
-            TensorDictSequential(policy, expert, self.mixture),
-            frames_per_batch=num_envs * steps,
-            total_frames=-1,
-            auto_register_policy_transforms=True,
-            trust_policy=True,
-            no_cuda_sync=True,
-        )
+        self.disturbance = Disturbance(0.0, torch.Generator().manual_seed(derive_seed(seed, "disturbance")))
+        flown = Ensemble(policies) if gate is not None and gate.measure is spread else policies[0]
+        gates = [] if gate is None else [gate]
+        behaviour = (flown, expert, self.mixture, *gates, self.disturbance)
+        super().__init__(config, num_envs, num_agents, behaviour, steps=steps, seed=seed, device=device)
         self.mixture.restart()  # the collector has tried the policy out
-        self.flights: Iterator[TensorDictBase] = iter(self.collector)
+        self.seen = 0
         # Not compilable ones would share their counters between processes, and start one of their own for that.
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(settings.capacity, device=device, compilable=True),
@@ -86,50 +160,102 @@ class Flocks:
     def fly(self, expert_share: float) -> TensorDictBase:
         """Continue the flights by some steps, and label every state with the expert's action; flights [B, T]."""
         self.mixture.share = expert_share
-        with torch.no_grad():
-            return next(self.flights)
+        return self.continue_flights()
 
     def keep(self, flights: TensorDictBase) -> None:
-        """Add flights to the data."""
-        self.buffer.extend(as_windows(flights.select(*self.keys, strict=False), self.window, self.every))
+        """Add windows of flights to the data; where these are full, what ``settings.replacement`` says goes."""
+        windows = as_windows(flights.select(*self.keys, strict=False), self.window, self.settings.every)
+        room = max(0, self.settings.capacity - self.seen) if self.settings.replacement == "reservoir" else len(windows)
+        if room:
+            self.buffer.extend(windows[:room])
+        if room < len(windows):
+            place, item = reservoir_places(self.seen + room, len(windows) - room, self.settings.capacity, self.noise)
+            self.buffer[place.to(windows.device)] = windows[room + item.to(windows.device)]
+        self.seen += len(windows)
 
     @property
     def generators(self) -> dict[str, torch.Generator]:
         """All that draws at random here, by name."""
-        size = self.num_agents
-        return {
-            f"{size}.env": self.env.generator,
-            f"{size}.faults": self.env.faults.generator,
-            f"{size}.mixture": self.mixture.generator,
-            f"{size}.batches": self.buffer._rng,
+        drawn = {
+            "mixture": self.mixture.generator,
+            "disturbance": self.disturbance.generator,
+            "batches": self.buffer._rng,
         }
+        return {**super().generators, **{f"{self.num_agents}.{name}": value for name, value in drawn.items()}}
 
-    def close(self) -> None:
-        """End the flights."""
-        self.collector.shutdown()
+
+def reservoir_places(
+    seen: int, count: int, capacity: int, generator: torch.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Reservoir sampling (Vitter 1985): which of new items replace which, so that all ever seen are kept alike.
+
+    Args:
+        seen: items seen before, at least ``capacity``.
+        count: new items.
+        capacity: items kept.
+        generator: source of randomness.
+
+    Returns:
+        places in the store, and the new items that go there, int64 [R] each; no place comes twice.
+    """
+    items = torch.arange(count)
+    chance = torch.rand(count, generator=generator, dtype=torch.float64)
+    drawn = (chance * (seen + items + 1)).long()
+    stays = drawn < capacity
+    place, item = drawn[stays], items[stays]
+    last = torch.full((capacity,), -1).scatter_reduce(0, place, item, "amax")  # a later item goes over an earlier one
+    place = (last >= 0).nonzero().squeeze(-1)
+    return place, last[place]
+
+
+def window_of(policies: Sequence[ModGNN], settings: ImitationConfig) -> int:
+    """Steps of the windows that policies learn from: one, with the stored messages, where that is enough."""
+    alone = len({(str(policy), policy.hops) for policy in policies}) == 1
+    if alone and stores_messages(policies[0]) and not settings.hide_velocity:
+        return 1
+    return max(policy.window for policy in policies)
 
 
 def flocks_of_all_sizes(
-    config: TrainConfig, policy: ModGNN, expert: TensorDictModuleBase, *, steps: int, stretch: int
+    config: TrainConfig,
+    policies: Sequence[ModGNN],
+    expert: TensorDictModuleBase,
+    *,
+    steps: int,
+    stretch: int,
+    gate: SafetyGate | None = None,
 ) -> list[Flocks]:
     """The flocks of a training run, one group for each size in ``config.env.num_agents``, of as many agents each."""
-    sizes = config.env.sizes
-    agents = REFERENCE_SIZE * config.trainer.num_envs / len(sizes)
     return [
         Flocks(
             config.env,
             config.trainer,
-            max(1, round(agents / size)),
+            flocks_of(size, config),
             size,
-            policy,
+            policies,
             expert,
             steps=steps,
             stretch=stretch,
+            gate=gate,
             seed=derive_seed(config.seed, "flocks", size),
             device=config.device,
         )
-        for size in sizes
+        for size in config.env.sizes
     ]
+
+
+def stores_messages(policy: ModGNN) -> bool:
+    """Whether a policy is trained with the messages that it received in flight; if not, windows make them anew.
+
+    They must hold no trace of a parameter, and turn with a rotated state: as sums of observations do, and as all does
+    that an equivariant policy sends, whose states need no rotation.
+    """
+    return policy.sends_plain_data and (len(policy.layers) == 1 or is_equivariant(policy))
+
+
+def flocks_of(size: int, config: TrainConfig) -> int:
+    """How many flocks of a size a run flies at once, so that each size has as many agents."""
+    return max(1, round(REFERENCE_SIZE * config.trainer.num_envs / len(config.env.sizes) / size))
 
 
 def as_windows(flights: TensorDictBase, length: int, every: int) -> TensorDictBase:

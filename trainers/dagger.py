@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import DAggerConfig, TrainConfig
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.loggers import GuardedLogger
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.trainers.callbacks import Callback, StopOnPlateau
 from modgnn_rl.trainers.collection import flocks_of_all_sizes
 from modgnn_rl.trainers.journal import Journal, flight_metrics
-from modgnn_rl.trainers.mixing import expert_share
+from modgnn_rl.trainers.learner import fit_together
+from modgnn_rl.trainers.mixing import SafetyGate, disagreement, expert_share, spread
 from modgnn_rl.trainers.setup import make_learner
 
 __all__ = ["dagger"]
 
+GATES = {"disagreement": disagreement, "ensemble": spread}
 
-def dagger(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN:
+
+def dagger(
+    config: TrainConfig,
+    run: RunFolder,
+    logger: GuardedLogger,
+    *,
+    expert: TensorDictModuleBase | None = None,
+    callbacks: Sequence[Callback] = (),
+) -> dict[str, ModGNN]:
     """Train a policy with DAgger.
 
     The expert flies first and the policy clones it. Then, round by round, mixture and policy go on flying the same
@@ -28,24 +42,41 @@ def dagger(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN
         config: the run's settings, ``config.trainer`` being a `DAggerConfig`.
         run: the folder to leave metrics and checkpoints in.
         logger: the dashboard.
+        expert: writes ``("agents", "expert_action")``; default: Reynolds flocking.
+        callbacks: people's own code.
 
     Returns:
-        the trained policy.
+        the trained policy, by the name of its model.
     """
     settings: DAggerConfig = config.trainer
     sizes = config.env.sizes
     cloning = settings.cloning_updates // len(sizes)
     fitting = settings.round_updates // len(sizes)
     updates = (cloning + settings.rounds * fitting) * len(sizes)
-    learner = make_learner(config, (cloning * len(sizes), updates))
-    expert = Reynolds.for_env(config.env)
-    flocks = flocks_of_all_sizes(config, learner.flown, expert, steps=settings.round_steps, stretch=settings.stretch)
+    expert = expert or Reynolds.for_env(config.env)
+    members = settings.ensemble if settings.gate == "ensemble" else 1
+    learners = [make_learner(config, (cloning * len(sizes), updates), member) for member in range(members)]
+    gate = None if settings.gate == "none" else SafetyGate(GATES[settings.gate], settings.gate_threshold)
+    flocks = flocks_of_all_sizes(
+        config,
+        [learner.flown for learner in learners],
+        expert,
+        steps=settings.round_steps,
+        stretch=settings.stretch,
+        gate=gate,
+    )
+    names = [config.model.name, *(f"ensemble_{member}" for member in range(1, members))]
+    if settings.plateau_rounds:
+        errors = [f"{size}/error" for size in sizes]
+        plateau = StopOnPlateau(settings.plateau_rounds, settings.plateau_gain, errors, after=settings.expert_rounds)
+        callbacks = [*callbacks, plateau]
 
-    with Journal(run, logger, learner, flocks, updates, settings) as journal:
+    by_name = dict(zip(names, learners, strict=True))
+    with Journal(run, logger, by_name, flocks, updates, settings, callbacks) as journal:
         for group in flocks:
             for _ in range(math.ceil(settings.cloning_steps / settings.round_steps)):
-                group.keep(group.fly(expert_share=1.0))
-            loss = learner.fit(group.buffer, cloning)
+                group.keep(journal.show(0, group.fly(expert_share=1.0)))
+            loss, *_ = fit_together(learners, group.buffer, cloning)
             journal.note(0, {f"{group.num_agents}/loss": loss}, cloning, cloned=loss)
 
         for index in range(settings.rounds):
@@ -56,13 +87,15 @@ def dagger(config: TrainConfig, run: RunFolder, logger: GuardedLogger) -> ModGNN
                 decay=settings.share_decay,
                 last_round=settings.expert_rounds,
             )
-            metrics = {"expert_share": share, "learning_rate": learner.learning_rate}
+            metrics = {"expert_share": share, "learning_rate": learners[0].learning_rate}
             for group in flocks:
-                flights = group.fly(share)
+                flights = journal.show(index + 1, group.fly(share))
                 group.keep(flights)
                 metrics |= flight_metrics(flights, config.env)
-                metrics[f"{group.num_agents}/loss"] = learner.fit(group.buffer, fitting)
+                metrics[f"{group.num_agents}/loss"], *_ = fit_together(learners, group.buffer, fitting)
             error = sum(metrics[f"{size}/error"] for size in sizes) / len(sizes)
-            journal.note(index + 1, metrics, fitting * len(sizes), round=f"{index + 1}/{settings.rounds}", error=error)
+            round_ = f"{index + 1}/{settings.rounds}"
+            if journal.note(index + 1, metrics, fitting * len(sizes), round=round_, error=error):
+                break
 
-    return learner.flown
+    return {config.model.name: learners[0].flown}

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.func import functional_call, stack_module_state, vmap
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl.modgnn import ModGNN
 
-__all__ = ["imitation_loss", "random_receivers", "random_rotations", "rotate"]
+__all__ = [
+    "hide_velocities",
+    "imitation_loss",
+    "random_receivers",
+    "random_rotations",
+    "rotate",
+    "stacked_losses",
+]
 
 
 def imitation_loss(policy: ModGNN, batch: TensorDictBase, receivers: Tensor) -> Tensor:
@@ -22,11 +32,65 @@ def imitation_loss(policy: ModGNN, batch: TensorDictBase, receivers: Tensor) -> 
         batch: windows [S, W] with the policy's in-keys and ``("agents", "expert_action")`` [S, W, N, 3].
         receivers: the agents whose error counts, bool [S, N].
     """
-    wanted = torch.zeros_like(batch["agents", "controlled"])
-    wanted[:, -1] = receivers
+    wanted = _at_the_end(batch, receivers)
     with set_recurrent_mode(True):
         action = policy(batch.copy(), receivers=wanted)["agents", "action"]
     return (action - batch["agents", "expert_action"])[wanted].square().mean()
+
+
+def stacked_losses(policies: Sequence[ModGNN], batch: TensorDictBase, receivers: Tensor) -> list[Tensor]:
+    """`imitation_loss` of policies that differ in their weights only, computed at once (``torch.func.vmap``).
+
+    The gradients are added to those that the weights hold.
+
+    Args:
+        policies: P of them.
+        batch: windows [S, W], see `imitation_loss`.
+        receivers: the agents whose error counts, bool [S, N].
+
+    Returns:
+        the P losses, without gradient.
+    """
+    wanted = _at_the_end(batch, receivers)
+    expert = batch["agents", "expert_action"]
+    weights, buffers = stack_module_state(list(policies))
+
+    def loss_of(weights: dict[str, Tensor], buffers: dict[str, Tensor]) -> Tensor:
+        result = functional_call(policies[0], (weights, buffers), (batch.copy(),), {"receivers": wanted})
+        difference = torch.where(wanted.unsqueeze(-1), result["agents", "action"] - expert, 0.0)
+        return difference.square().sum() / (wanted.sum() * expert.shape[-1])
+
+    with set_recurrent_mode(True):
+        losses = vmap(loss_of)(weights, buffers)
+    gradients = torch.autograd.grad(losses.sum(), list(weights.values()))
+    for name, gradient in zip(weights, gradients, strict=True):
+        for policy, part in zip(policies, gradient, strict=True):
+            parameter = policy.get_parameter(name)
+            parameter.grad = part.clone() if parameter.grad is None else parameter.grad + part
+    return list(losses.detach())
+
+
+def hide_velocities(batch: TensorDictBase, share: float, generator: torch.Generator) -> None:
+    """Zero the velocities of all agents in a random share of the windows [S, W], in place.
+
+    A cloned policy that reads its next action off its own velocity, a memory of the last one, runs away in flight.
+
+    Args:
+        batch: with observations (position, velocity) [S, W, N, 6], and without stored messages.
+        share: probability that a window is chosen.
+        generator: source of randomness.
+    """
+    observation = batch["agents", "observation"]
+    lot = torch.rand(len(batch), generator=generator, device=generator.device).to(observation.device)
+    hidden = (lot < share)[:, None, None, None] & (torch.arange(6, device=observation.device) >= 3)
+    batch["agents", "observation"] = observation.masked_fill(hidden, 0.0)
+
+
+def _at_the_end(batch: TensorDictBase, receivers: Tensor) -> Tensor:
+    """The receivers [S, N] at the last step of windows, bool [S, W, N]."""
+    wanted = torch.zeros_like(batch["agents", "controlled"])
+    wanted[:, -1] = receivers
+    return wanted
 
 
 def random_receivers(controlled: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -15,11 +15,21 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ImitationConfig
+from modgnn_rl.equivariant import is_equivariant
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.seeds import derive_seed
-from modgnn_rl.trainers.imitation import imitation_loss, random_receivers, random_rotations, rotate
+from modgnn_rl.trainers.imitation import (
+    hide_velocities,
+    imitation_loss,
+    random_receivers,
+    random_rotations,
+    rotate,
+    stacked_losses,
+)
 
-__all__ = ["Learner", "cosine_learning_rate"]
+__all__ = ["Learner", "cosine_learning_rate", "fit_together", "validate_together"]
+
+STACKED_PAIRS = 4096  # up to this many pairs of agents in a batch, several seeds learn faster as one
 
 
 class Learner:
@@ -29,7 +39,7 @@ class Learner:
         policy: the policy that is trained.
         settings: how it is trained.
         updates: updates until the first cosine of the learning rate ends, and of the whole run.
-        seed: seeds receivers and rotations.
+        seed: seeds receivers, rotations and what is hidden.
     """
 
     def __init__(self, policy: ModGNN, settings: ImitationConfig, updates: tuple[int, int], seed: int) -> None:
@@ -41,6 +51,7 @@ class Learner:
         self.scheduler = LambdaLR(
             self.optimizer, lambda step: cosine_learning_rate(step, settings.learning_rates, updates)
         )
+        self.turns = settings.rotate and not is_equivariant(policy)
         self.updates_done = 0
 
     @property
@@ -55,40 +66,37 @@ class Learner:
 
     def fit(self, buffer: ReplayBuffer, updates: int) -> float:
         """Take optimiser steps on batches of the buffer; returns their mean loss."""
-        losses = []
-        for _ in range(updates):
-            loss = self._loss(self.policy, buffer.sample())
-            self.optimizer.zero_grad()
-            loss.backward()
-            # The optimiser never steps on a gradient that is not finite.
-            torch.nn.utils.clip_grad_norm_(
-                self.policy.parameters(), self.settings.max_gradient, error_if_nonfinite=True
-            )
-            self.optimizer.step()
-            self.scheduler.step()
-            self.averaged.update_parameters(self.policy)
-            losses.append(loss.detach())
-        self.updates_done += updates
-        return float(torch.stack(losses).mean()) if losses else math.nan
+        return fit_together([self], buffer, updates)[0]
 
-    @torch.no_grad()
     def validate(self, buffer: ReplayBuffer) -> float:
         """The loss of the averaged policy on a batch of held-out data."""
-        return float(self._loss(self.flown, buffer.sample()))
+        return validate_together([self], buffer)[0]
 
-    def _loss(self, policy: ModGNN, batch: TensorDictBase) -> Tensor:
+    def prepare(self, batch: TensorDictBase, *, turn: bool) -> Tensor:
+        """Rotate and hide in a batch of windows [S, W], in place, and choose the agents that count, bool [S, N]."""
         settings = self.settings
-        if settings.rotate:
+        if turn:
             rotations = random_rotations(len(batch), batch["agents", "observation"], self.generator)
             vectors: list[NestedKey] = [("agents", "observation"), ("agents", "expert_action")]
-            # Messages are kept in the data only where they are sums of observations.
-            vectors += [policy.messages_key] if policy.messages_key in batch else []
+            # Messages are kept in the data of such policies only where they are sums of observations.
+            vectors += [self.policy.messages_key] if self.policy.messages_key in batch else []
             for key in vectors:
                 batch[key] = rotate(batch[key], rotations)
+        if settings.hide_velocity:
+            hide_velocities(batch, settings.hide_velocity, self.generator)
         controlled = batch["agents", "controlled"][:, -1]
         # At any size as many links as at 32 agents, so that an update takes as long.
         count = max(1, round(settings.receivers * REFERENCE_SIZE / controlled.shape[-1]))
-        return imitation_loss(policy, batch, random_receivers(controlled, count, self.generator))
+        return random_receivers(controlled, count, self.generator)
+
+    def step(self) -> None:
+        """Take an optimiser step along the gradients that the weights hold."""
+        # The optimiser never steps on a gradient that is not finite.
+        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.settings.max_gradient, error_if_nonfinite=True)
+        self.optimizer.step()
+        self.scheduler.step()
+        self.averaged.update_parameters(self.policy)
+        self.updates_done += 1
 
     def state(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
         """What a checkpoint holds of the learner: named tensors, and plain values."""
@@ -101,6 +109,54 @@ class Learner:
         }
         averaged = int(self.averaged.n_averaged)
         return tensors, {"updates": self.updates_done, "averaged": averaged, "learning_rate": self.learning_rate}
+
+
+def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int) -> list[float]:
+    """Let learners take optimiser steps on the same batches, with the same rotations and agents that count.
+
+    The data are read once. Of several learners the first draws. Seeds of one model are computed at once where the
+    batch is so small that this is faster; the steps are the same within rounding.
+
+    Args:
+        learners: they share settings, and need the same keys of the data, whose windows are as long as any needs.
+        buffer: windows [S, W].
+        updates: number of steps.
+
+    Returns:
+        the mean loss of each.
+    """
+    first, policies = learners[0], [learner.policy for learner in learners]
+    turn = any(learner.turns for learner in learners)
+    alike = len(learners) > 1 and len({_blueprint(policy) for policy in policies}) == 1
+    records = []
+    for _ in range(updates):
+        batch = buffer.sample()
+        receivers = first.prepare(batch, turn=turn)
+        for learner in learners:
+            learner.optimizer.zero_grad()
+        if alike and batch["agents", "controlled"].numel() * receivers.shape[-1] <= STACKED_PAIRS:
+            losses = stacked_losses(policies, batch, receivers)
+        else:
+            losses = [imitation_loss(policy, batch, receivers) for policy in policies]
+            for loss in losses:
+                loss.backward()
+        for learner in learners:
+            learner.step()
+        records.append(torch.stack([loss.detach() for loss in losses]))
+    return torch.stack(records).mean(0).tolist() if records else [math.nan] * len(learners)
+
+
+@torch.no_grad()
+def validate_together(learners: Sequence[Learner], buffer: ReplayBuffer) -> list[float]:
+    """The loss of the averaged policy of each learner, on one batch of held-out data."""
+    batch = buffer.sample()
+    receivers = learners[0].prepare(batch, turn=any(learner.turns for learner in learners))
+    return [float(imitation_loss(learner.flown, batch, receivers)) for learner in learners]
+
+
+def _blueprint(policy: ModGNN) -> str:
+    """What a policy is made of, whatever its weights."""
+    return f"{policy}{[(name, value.shape) for name, value in policy.state_dict().items()]}"
 
 
 def cosine_learning_rate(step: int, rates: Sequence[float], updates: tuple[int, int]) -> float:

@@ -1,7 +1,12 @@
-"""Who flies while DAgger collects: the policy, or the expert with a share that falls from round to round."""
+"""Who flies while data are collected: policy, expert, or whichever is safe; modules to put behind both in a sequence.
+
+A sequence ``policy, expert, Mixture, SafetyGate, Disturbance`` lets the policy's messages advance in any case, labels
+every state, and then chooses which action is flown.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -10,9 +15,11 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from modgnn_rl.cache import AgentCache
 from modgnn_rl.errors import InputError
+from modgnn_rl.modgnn import ModGNN
 
-__all__ = ["Mixture", "expert_share"]
+__all__ = ["Disturbance", "Ensemble", "Mixture", "SafetyGate", "disagreement", "expert_share", "spread"]
 
 
 def expert_share(schedule: str, round_index: int, *, start: float, decay: float, last_round: int) -> float:
@@ -90,3 +97,129 @@ class Mixture(TensorDictModuleBase):
         self._steps += 1
         chosen = torch.where(self._expert_flies.unsqueeze(-1), expert_action, action)
         return tensordict.set(self.out_keys[0], chosen).set(self.out_keys[1], self._expert_flies.clone())
+
+
+def disagreement(tensordict: TensorDictBase) -> Tensor:
+    """How far policy and expert are apart: root mean square over the flown agents of ``|a - a*|``, m/s [*B]."""
+    agents = tensordict["agents"]
+    difference = (agents["action"] - agents["expert_action"]).square().sum(-1)
+    return _root_mean(difference, agents["controlled"])
+
+
+def spread(tensordict: TensorDictBase) -> Tensor:
+    """How far the members of an `Ensemble` are apart: root mean square over the flown agents, m/s [*B]."""
+    agents = tensordict["agents"]
+    return _root_mean(agents["spread"].square(), agents["controlled"])
+
+
+def _root_mean(values: Tensor, counted: Tensor) -> Tensor:
+    """Root of the mean of [*B, N] over the agents that count, bool [*B, N]; 0 where none does."""
+    return (torch.where(counted, values, 0.0).sum(-1) / counted.sum(-1).clamp(min=1)).sqrt()
+
+
+class SafetyGate(TensorDictModuleBase):
+    """Let the expert fly a flock as long as the policy strays there.
+
+    With `disagreement` as measure this is the rule that SafeDAgger (Zhang and Cho 2017) learns to predict, here taken
+    from the expert itself; with `spread`, which asks no expert, EnsembleDAgger (Menda et al. 2019).
+
+    Args:
+        measure: from the data of a step to how much each flock strays [*B].
+        threshold: the expert flies above it.
+        action: key of the action to be flown, overwritten [*B, N, 3].
+        expert_action: key of the expert's action [*B, N, 3].
+        expert_flies: key that tells who flew, bool [*B, 1]; brought up to date where it is there.
+    """
+
+    def __init__(
+        self,
+        measure: Callable[[TensorDictBase], Tensor],
+        threshold: float,
+        *,
+        action: NestedKey = ("agents", "action"),
+        expert_action: NestedKey = ("agents", "expert_action"),
+        expert_flies: NestedKey = "expert_flies",
+    ) -> None:
+        super().__init__()
+        self.measure, self.threshold = measure, threshold
+        self.in_keys: list[Any] = [action, expert_action]
+        self.out_keys: list[Any] = [action, expert_flies]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Choose the action of each flock."""
+        action, expert_action = (tensordict[key] for key in self.in_keys)
+        strays = (self.measure(tensordict) > self.threshold).unsqueeze(-1)
+        flies = tensordict.get(self.out_keys[1], None)
+        tensordict.set(self.out_keys[0], torch.where(strays.unsqueeze(-1), expert_action, action))
+        return tensordict.set(self.out_keys[1], strays if flies is None else flies | strays)
+
+
+class Disturbance(TensorDictModuleBase):
+    """Noise in what is flown, so that the expert shows how it recovers (DART, Laskey et al. 2017).
+
+    ``a + N(0, scale^2)`` in each component, at every step anew; labels are left as they are.
+
+    Args:
+        scale: standard deviation, m/s; may be set anew at any time. DART takes the root of the policy's mean squared
+            error.
+        generator: source of randomness.
+        action: key of the action to be flown, overwritten [*B, N, 3].
+    """
+
+    def __init__(self, scale: float, generator: torch.Generator, *, action: NestedKey = ("agents", "action")) -> None:
+        super().__init__()
+        self.scale, self.generator = scale, generator
+        self.in_keys: list[Any] = [action]
+        self.out_keys: list[Any] = [action]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Disturb the action."""
+        action = tensordict[self.in_keys[0]]
+        if self.scale == 0:
+            return tensordict
+        generator = self.generator
+        noise = torch.randn(action.shape, generator=generator, device=generator.device, dtype=action.dtype)
+        return tensordict.set(self.out_keys[0], action + self.scale * noise.to(action.device))
+
+
+class Ensemble(TensorDictModuleBase):
+    """Several policies, of which the first flies; how far they are apart is written beside its action.
+
+    Each keeps messages of its own. For single steps, not for windows.
+
+    Args:
+        members: the policies; they read and write the same keys.
+        spread: key of the root mean square distance of the members' actions from their mean, m/s [*B, N].
+    """
+
+    def __init__(self, members: Sequence[ModGNN], *, spread: NestedKey = ("agents", "spread")) -> None:
+        super().__init__()
+        self.first = members[0]
+        # Not registered: the first member's messages are the ones that an environment's primer is made for.
+        self._others = tuple(members[1:])
+        self._messages = [f"{self.first.messages_key}_{number}" for number in range(1, len(members))]
+        self.in_keys: list[Any] = [*self.first.in_keys, *self._messages]
+        self.out_keys: list[Any] = [*self.first.out_keys, *(("next", key) for key in self._messages), spread]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the first member's action and messages, the others' messages, and the spread."""
+        key, messages = self.first.out_keys[0], self.first.messages_key
+        given = tensordict.copy()
+        actions = [self.first(tensordict)[key]]
+        for member, own in zip(self._others, self._messages, strict=True):
+            seen = given.copy()
+            remembered = given.get(own, None)
+            if remembered is not None:
+                seen[messages] = remembered
+            elif messages in seen:
+                del seen[messages]
+            result = member(seen)
+            actions.append(result[key])
+            tensordict.set(("next", own), result["next", messages])
+        stacked = torch.stack(actions)
+        distance = (stacked - stacked.mean(0)).square().sum(-1).mean(0).sqrt()
+        return tensordict.set(self.out_keys[-1], distance)
+
+    def make_tensordict_primer(self) -> AgentCache:
+        """The transform that gives an environment the other members' messages; the first brings its own."""
+        return AgentCache(self, self._messages, is_init=self.first.in_keys[2])

@@ -1,29 +1,92 @@
-"""What every imitation trainer starts from: policy, learner, expert."""
+"""What every trainer starts from: a configuration that makes sense, policies, learners."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 
-from modgnn_rl.configs.schema import BCConfig, ImitationConfig, TrainConfig
+from modgnn_rl.configs.schema import BCConfig, DAggerConfig, ModelConfig, TrainConfig, TrainerConfig, as_list
 from modgnn_rl.dataset import FlightDataset
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
+from modgnn_rl.loading import load_policy, stored_model
 from modgnn_rl.models import configured_model
+from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.learner import Learner
 
-__all__ = ["check_training", "make_learner"]
+__all__ = ["check_training", "initial_policy", "make_learner", "settle_model", "side_by_side"]
 
 
-def make_learner(config: TrainConfig, updates: tuple[int, int]) -> Learner:
-    """The learner of a run: a fresh policy of ``config.model`` on the run's device.
+def make_learner(config: TrainConfig, updates: tuple[int, int], member: int = 0) -> Learner:
+    """The learner of a run, or one of several that differ in the weights that they begin with.
 
     Args:
         config: the run's settings.
         updates: updates until the first cosine of the learning rate ends, and of the whole run.
+        member: which of several.
     """
-    policy = configured_model(config.model, config.env, derive_seed(config.seed, "model"))
-    return Learner(policy.to(config.device), config.trainer, updates, config.seed)
+    return Learner(initial_policy(config, member), config.trainer, updates, config.seed)
+
+
+def initial_policy(config: TrainConfig, member: int = 0) -> ModGNN:
+    """The policy that a run begins with: that of another run, or a fresh one of ``config.model``; on the run's device.
+
+    Raises:
+        InputError: no readable run ``config.init_from``.
+    """
+    if config.init_from is not None:
+        return load_policy(config.init_from, device=config.device).train()
+    role = ("model", member) if member else ("model",)
+    return configured_model(config.model, config.env, derive_seed(config.seed, *role)).to(config.device)
+
+
+def side_by_side(config: TrainConfig) -> dict[str, TrainConfig]:
+    """The settings of each policy that behaviour cloning trains at once, by name: model, hops, seed.
+
+    One policy goes by the name of its model.
+    """
+    settings: BCConfig = config.trainer
+    alone = dataclasses.replace(settings, models=None, hops=None, seeds=1)
+    members = {}
+    for name in as_list(settings.models or config.model.name):
+        for hops in as_list(config.model.hops if settings.hops is None else settings.hops):
+            for seed in range(settings.seeds):
+                members[f"{name}-K{hops}" + (f"-seed{seed}" if settings.seeds > 1 else "")] = dataclasses.replace(
+                    config,
+                    trainer=alone,
+                    model=dataclasses.replace(config.model, name=name, hops=hops),
+                    seed=derive_seed(config.seed, "member", seed) if seed else config.seed,
+                )
+    return members if len(members) > 1 else {member.model.name: member for member in members.values()}
+
+
+def settle_model(config: TrainConfig) -> TrainConfig:
+    """The settings with the model of the run that training begins with, or the first of several trained side by side.
+
+    Raises:
+        InputError: no readable run ``config.init_from``, or another model was asked for.
+    """
+    if isinstance(config.trainer, BCConfig) and (config.trainer.models, config.trainer.hops) != (None, None):
+        return dataclasses.replace(config, model=next(iter(side_by_side(config).values())).model)
+    if config.init_from is None:
+        return config
+    model = stored_model(RunFolder.open(config.init_from))
+    if config.model not in (model, ModelConfig()):
+        raise InputError(
+            f"model={config.model} is not that of init_from={config.init_from}, {model}; leave the model out, it comes "
+            "from there"
+        )
+    return dataclasses.replace(config, model=model)
+
+
+def _members(config: TrainConfig) -> list[TrainConfig]:
+    """The settings of each policy that is trained."""
+    settings = config.trainer
+    if isinstance(settings, DAggerConfig) and settings.gate == "ensemble":
+        return [config] * settings.ensemble
+    return list(side_by_side(config).values()) if isinstance(settings, BCConfig) else [config]
 
 
 def check_training(config: TrainConfig) -> None:
@@ -31,9 +94,10 @@ def check_training(config: TrainConfig) -> None:
 
     Raises:
         InputError: sizes that repeat or hold no agent to train, too few updates for the sizes, a model with nothing to
-            learn, agents that do not fit into the ball they start in, or a dataset that is damaged or does not fit.
+            learn, several policies that would begin alike, agents that do not fit into the ball they start in, or a
+            dataset that is damaged or does not fit.
     """
-    settings: ImitationConfig = config.trainer
+    settings: TrainerConfig = config.trainer
     sizes = config.env.sizes
     if len(set(sizes)) != len(sizes) or min(sizes) < 2:
         raise InputError(
@@ -43,8 +107,13 @@ def check_training(config: TrainConfig) -> None:
         updates = getattr(settings, name, None)
         if updates and updates < len(sizes):
             raise InputError(f"trainer.{name}={updates} is too few for {len(sizes)} sizes; give at least one to each")
-    if not list(make_learner(config, (0, 0)).policy.parameters()):
-        raise InputError(f"model.name={config.model.name} with model.hops={config.model.hops} has nothing to learn")
+    if config.init_from is not None and len(_members(config)) > 1:
+        raise InputError(
+            "several policies cannot all begin with that of init_from, and stay alike: leave it out, or train one"
+        )
+    for member in _members(config):
+        if not list(initial_policy(member).parameters()):
+            raise InputError(f"model.name={member.model.name} with model.hops={member.model.hops} has nothing to learn")
     for size in sizes:
         with contextlib.closing(FlockingEnv(1, size, config=config.env, seed=config.seed)) as env:
             env.reset()

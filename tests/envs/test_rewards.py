@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.rewards import COSTS, flocking_costs, flocking_reward, reward_weights
 from modgnn_rl.tensors import pair_distances
 
-DISTANCES = {"crowding_distance": 0.9, "collision_distance": 0.5}
+DISTANCES: Any = {"crowding_distance": 0.9, "collision_distance": 0.5}
 
 
 def random_step(*shape: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
@@ -30,7 +31,7 @@ def test_costs_equal_their_formulas() -> None:
     costs = costs_of(position, velocity, target)
     assert list(costs) == list(COSTS)
     for flock in range(3):
-        centre, mean = sum(position[flock]) / 5, sum(velocity[flock]) / 5
+        centre, mean = position[flock].mean(0), velocity[flock].mean(0)
         for i in range(5):
             nearest = min(math.dist(position[flock, i], position[flock, j]) for j in range(5) if j != i)
             expected = {

@@ -38,7 +38,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def _without_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
     """What follows the training takes longer than it, and is tested elsewhere."""
-    monkeypatch.setattr(training, "evaluate_policy", lambda *_: {})
+    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
 
 
 def run_bc(
@@ -70,7 +70,7 @@ def test_held_out_flights_are_not_trained_on(tmp_path: Path, dataset: Path, monk
     assert read == {range(4): {0, 1, 2, 3}, range(4, 6): {4, 5}}
     assert len(metrics) == 20
     assert {"5/loss", "5/validation_loss"} <= set(metrics[0])
-    assert {"5/error", "5/lost"} <= set(metrics[-1])
+    assert "5/error" in metrics[-1]
 
 
 def test_a_learner_fits_a_dataset(dataset: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_learner_fits_a_dataset(dataset: Path) -> None:
 def test_one_seed_fixes_a_run_and_its_generators_are_kept(tmp_path: Path, dataset: Path) -> None:
     runs = [run_bc(tmp_path, dataset, model="modgnn_mlp") for _ in range(2)]
     assert runs[0].metrics_file.read_bytes() == runs[1].metrics_file.read_bytes()
-    states = [load_checkpoint(run.checkpoints).tensors["generators"]["5.batches"] for run in runs]
+    states = [load_checkpoint(run.checkpoints).tensors["generators"]["0.5.batches"] for run in runs]
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], torch.Generator().manual_seed(0).get_state())
 

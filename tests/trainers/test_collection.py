@@ -16,7 +16,7 @@ from modgnn_rl.trainers.collection import Flocks, as_windows, flocks_of_all_size
 def _flocks(policy, *, seed=0, steps=10, every=2, **world):
     settings = DAggerConfig(every=every, capacity=1000, batch_size=16)
     config = FlockingConfig(**world)
-    return Flocks(config, settings, 4, 5, policy, Reynolds(), steps=steps, stretch=steps, seed=seed)
+    return Flocks(config, settings, 4, 5, [policy], Reynolds(), steps=steps, stretch=steps, seed=seed)
 
 
 def test_windows_end_at_every_so_manyth_step():
@@ -83,6 +83,6 @@ def test_learned_messages_are_kept_as_windows_without_the_stale_ones():
 
 def test_sizes_share_the_agents():
     config = TrainConfig(env=FlockingConfig(num_agents=[4, 8, 32]), trainer=DAggerConfig(num_envs=6))
-    flocks = flocks_of_all_sizes(config, make_model("gcn", seed=0), Reynolds(), steps=2, stretch=2)
+    flocks = flocks_of_all_sizes(config, [make_model("gcn", seed=0)], Reynolds(), steps=2, stretch=2)
     shapes = [group.fly(0.0)["adjacency"].shape for group in flocks]
     assert shapes == [(16, 2, 4, 4), (8, 2, 8, 8), (2, 2, 32, 32)]

@@ -20,7 +20,9 @@ RATES = (3e-3, 1e-3, 1e-4)
 @pytest.fixture(scope="module")
 def flights():
     settings = DAggerConfig(capacity=500, batch_size=64)
-    return Flocks(FlockingConfig(), settings, 8, 6, make_model("gcn", seed=0), Reynolds(), steps=40, stretch=40, seed=0)
+    return Flocks(
+        FlockingConfig(), settings, 8, 6, [make_model("gcn", seed=0)], Reynolds(), steps=40, stretch=40, seed=0
+    )
 
 
 def _learner(**settings):
@@ -63,7 +65,7 @@ def test_one_seed_fixes_the_weights():
     for _ in range(2):
         settings = DAggerConfig(capacity=500, batch_size=64)
         learner = _learner()
-        group = Flocks(FlockingConfig(), settings, 8, 6, learner.flown, Reynolds(), steps=40, stretch=40, seed=0)
+        group = Flocks(FlockingConfig(), settings, 8, 6, [learner.flown], Reynolds(), steps=40, stretch=40, seed=0)
         group.keep(group.fly(0.5))
         learner.fit(group.buffer, 5)
         weights.append(torch.cat([parameter.flatten() for parameter in learner.flown.parameters()]))

@@ -1,0 +1,86 @@
+"""Where people's own code is called while a trainer works, and stopping on a plateau, which is such code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from tensordict import TensorDictBase
+
+from modgnn_rl.modgnn import ModGNN
+
+__all__ = ["Callback", "StopOnPlateau"]
+
+
+class Callback:
+    """Called at four places of every trainer; each does nothing unless overridden.
+
+    Example::
+
+        class Print(Callback):
+            def on_round(self, index, metrics):
+                print(index, metrics["32/error"])
+
+        modgnn_rl.training.train(config, callbacks=[Print()])
+    """
+
+    def on_start(self, policies: Mapping[str, ModGNN]) -> None:
+        """Training begins.
+
+        Args:
+            policies: what will be returned at the end, by name; their weights change while training goes on.
+        """
+
+    def on_flights(self, index: int, flights: TensorDictBase) -> None:
+        """Flights of a round have come in and are not yet learned from.
+
+        Args:
+            index: number of the round.
+            flights: [B, T]; what is changed in place is learned from.
+        """
+
+    def on_round(self, index: int, metrics: Mapping[str, float]) -> bool | None:
+        """A round is over.
+
+        Args:
+            index: number of the round.
+            metrics: as in ``metrics.jsonl``.
+
+        Returns:
+            true to stop the training here; the policy is evaluated as at the planned end.
+        """
+
+    def on_end(self, policies: Mapping[str, ModGNN]) -> None:
+        """Training is over, but not interrupted.
+
+        Args:
+            policies: what is returned, by name.
+        """
+
+
+class StopOnPlateau(Callback):
+    """Stop when a metric does not fall any more.
+
+    Training stops after a round when the metric's mean over the last ``rounds`` rounds is not at least the share
+    ``gain`` below that over the ``rounds`` rounds before them.
+
+    Args:
+        rounds: how many rounds are compared with as many before.
+        gain: smallest relative improvement.
+        names: metrics whose mean is looked at, one for each size of flocks; rounds without them do not count.
+        after: rounds that are left out at first, while the expert still flies.
+    """
+
+    def __init__(self, rounds: int, gain: float, names: Sequence[str], after: int = 0) -> None:
+        self.rounds, self.gain, self.names, self.after = rounds, gain, tuple(names), after
+        self.seen: list[float] = []
+
+    def on_round(self, index: int, metrics: Mapping[str, float]) -> bool:
+        """Look at the metric."""
+        value = sum(metrics.get(name, math.nan) for name in self.names) / len(self.names)
+        if index > self.after and math.isfinite(value):
+            self.seen.append(value)
+        if len(self.seen) < 2 * self.rounds:
+            return False
+        before, now = sum(self.seen[-2 * self.rounds : -self.rounds]), sum(self.seen[-self.rounds :])
+        return now > (1 - self.gain) * before

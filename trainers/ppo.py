@@ -1,0 +1,223 @@
+"""Proximal policy optimisation of a flock's policy (MAPPO, Yu et al. 2022): advantages, loss, optimiser steps."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
+from torchrl.modules import PopArtValueNorm, set_recurrent_mode
+from torchrl.objectives import MAPPOLoss, ValueEstimators
+
+from modgnn_rl.configs.schema import REFERENCE_SIZE, MAPPOConfig
+from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.seeds import derive_seed
+from modgnn_rl.trainers.actor import GaussianActor
+from modgnn_rl.trainers.collection import as_windows
+from modgnn_rl.trainers.critic import FlockCritic
+from modgnn_rl.trainers.imitation import random_receivers
+
+__all__ = ["AnchoredMAPPOLoss", "Improver"]
+
+ANCHOR = ("agents", "anchor")
+RECEIVERS = ("agents", "receivers")
+
+
+class AnchoredMAPPOLoss(MAPPOLoss):
+    """TorchRL's `MAPPOLoss` with a pull towards the actions of another policy.
+
+    Where the data have its actions under ``anchor`` [*B, N, A], the result has also ``loss_anchor``: ``anchor_coeff``
+    times the Kullback-Leibler divergence ``|mu - anchor|^2 / (2 sigma^2)`` of two normal distributions of one width.
+
+    Args:
+        anchor: key of the other policy's actions.
+        anchor_coeff: weight of the pull; an attribute, which may be changed at any time.
+        arguments, options: see `torchrl.objectives.multiagent.MAPPOLoss`.
+    """
+
+    def __init__(self, *arguments: Any, anchor: Any = ANCHOR, anchor_coeff: float = 0.0, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.anchor_key, self.anchor_coeff = anchor, anchor_coeff
+        self._dist: Any = None
+
+    def _get_cur_log_prob(self, tensordict: TensorDictBase, params: Any = None) -> Any:
+        found = super()._get_cur_log_prob(tensordict, params)
+        self._dist = found[1]
+        return found
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute all losses, see `MAPPOLoss`; unlike there, ``kl_approx`` and ``clip_fraction`` heed the mask."""
+        losses = super().forward(tensordict)
+        dist, self._dist = self._dist, None
+        anchor = tensordict.get(self.anchor_key, None)
+        if anchor is not None:
+            divergence = ((dist.mean - anchor) / dist.stddev).square().sum(-1, keepdim=True) / 2
+            losses.set("loss_anchor", self.anchor_coeff * self._reduce_loss(divergence, tensordict))
+        with torch.no_grad():
+            action, before = (tensordict[key] for key in (self.tensor_keys.action, self.tensor_keys.sample_log_prob))
+            ratio = (dist.log_prob(action) - before).unsqueeze(-1)
+            low, high = self._clip_bounds
+            clipped = ((ratio < low) | (ratio > high)).to(ratio.dtype)
+            losses.set("kl_approx", self._reduce_loss(ratio.exp() - 1 - ratio, tensordict))
+            losses.set("clip_fraction", self._reduce_loss(clipped, tensordict))
+        return losses
+
+
+class Improver:
+    """Improves a policy on flights of its own: actor, critic, optimisers, and the moving average of the policy.
+
+    Args:
+        policy: the policy that is improved; it is also what the pull leads back to.
+        settings: how.
+        state: key of the true states, which the critic sees.
+        seed: seeds the order of batches and the choice of receivers.
+    """
+
+    def __init__(self, policy: ModGNN, settings: MAPPOConfig, state: Any, seed: int) -> None:
+        self.settings = settings
+        self.policy = policy
+        self.anchor = copy.deepcopy(policy).requires_grad_(False)
+        self.averaged = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.averaging))
+        self.device = device = next(policy.parameters()).device
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, "receivers"))
+        self.order = torch.Generator(device).manual_seed(derive_seed(seed, "order"))
+        self.actor = GaussianActor(policy, settings.noise).to(device)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(derive_seed(seed, "critic"))
+            self.critic = FlockCritic(state, hidden=settings.critic_hidden).to(device)
+        self.loss = AnchoredMAPPOLoss(
+            self.actor,
+            self.critic,
+            value_norm=PopArtValueNorm(beta=0.995, device=device),
+            clip_epsilon=settings.clip,
+            entropy_coeff=settings.entropy,
+            normalize_advantage=False,  # done over whole flights, and over agents that are flown
+            functional=False,
+            log_explained_variance=False,
+        )
+        self.loss.set_keys(
+            action=policy.out_keys[0],
+            value=self.critic.out_keys[0],
+            sample_log_prob=("agents", "action_log_prob"),
+            reward=("agents", "reward"),
+            advantage=("agents", "advantage"),
+            value_target=("agents", "value_target"),
+        )
+        self.loss.make_value_estimator(ValueEstimators.MAGAE, gamma=settings.discount, lmbda=settings.trace)
+        groups = [
+            {"params": list(self.actor.parameters()), "lr": settings.learning_rate},
+            {"params": list(self.critic.parameters()), "lr": settings.critic_learning_rate},
+        ]
+        self.optimizer = torch.optim.Adam(groups)
+        self.updates_done = 0
+
+    @property
+    def flown(self) -> ModGNN:
+        """The moving average of the policy: it is evaluated and is what a run ends with."""
+        return cast(ModGNN, self.averaged.module)
+
+    @property
+    def burn_in(self) -> int:
+        """Steps before a window after which its messages are exact; none where the stored ones are."""
+        return 0 if self.policy.sends_plain_data else self.policy.hops
+
+    @torch.no_grad()
+    def judge(self, flights: TensorDictBase) -> None:
+        """Write advantages, value targets and the anchor's actions into flights [B, T].
+
+        Rewards count ``1 - discount`` times, so that values are those of a mean step. The end of a flight, whether
+        truncated or terminated, does not end what it is worth: else flocks whose every step costs would do well to
+        collide.
+        """
+        settings = self.settings
+        judged = flights.clone()
+        judged["next", "agents", "reward"] *= 1 - settings.discount
+        judged["next", "terminated"] = torch.zeros_like(judged["next", "terminated"])
+        self.loss.value_estimator(judged)
+        controlled = flights["agents", "controlled"].unsqueeze(-1)
+        advantage = judged["agents", "advantage"]
+        counted = advantage[controlled]
+        flights["agents", "advantage"] = (advantage - counted.mean()) / counted.std().clamp(min=1e-6)
+        flights["agents", "value_target"] = judged["agents", "value_target"]
+        if self.loss.anchor_coeff > 0:
+            with set_recurrent_mode(True):
+                flights[ANCHOR] = self.anchor(flights.select(*self.anchor.in_keys, strict=False))["agents", "action"]
+
+    def improve(self, flights: TensorDictBase, *, only_critic: bool = False, anchor: float = 0.0) -> dict[str, float]:
+        """Take optimiser steps on flights [B, T] of the actor's own; the first ``burn_in`` steps are not trained on.
+
+        Args:
+            flights: as the actor flew them.
+            only_critic: leave the policy as it is.
+            anchor: weight of the pull towards the policy that this one began as.
+
+        Returns:
+            means of the losses and of what tells how they fare.
+        """
+        settings = self.settings
+        self.loss.anchor_coeff = 0.0 if only_critic else anchor
+        self.judge(flights)
+        length = self.burn_in + (1 if self.burn_in == 0 else settings.window)
+        kept = [
+            *self.policy.in_keys,
+            *(("agents", name) for name in ("controlled", "action", "action_log_prob", "advantage", "value_target")),
+            self.critic.state_key,
+            ANCHOR,
+        ]
+        windows = as_windows(flights.select(*kept, strict=False), length, length - self.burn_in)
+        buffer = ReplayBuffer(
+            storage=LazyTensorStorage(len(windows), device=self.device, compilable=True),
+            sampler=SamplerWithoutReplacement(),
+            batch_size=-(-len(windows) // settings.batches),
+            generator=self.order,
+        )
+        buffer.extend(windows)
+        records = []
+        for _ in range(settings.epochs):
+            for batch in buffer:
+                records.append(self._update(batch, only_critic))
+        names = records[0]
+        return {name: float(torch.stack([record[name] for record in records]).mean()) for name in names}
+
+    def _update(self, batch: TensorDictBase, only_critic: bool) -> dict[str, Tensor]:
+        """One optimiser step on windows [S, W]."""
+        settings = self.settings
+        controlled = batch["agents", "controlled"]
+        count = max(1, round(settings.receivers * REFERENCE_SIZE / controlled.shape[-1]))
+        chosen = random_receivers(controlled.flatten(0, 1), count, self.generator).view_as(controlled)
+        chosen[:, : self.burn_in] = False
+        batch = batch.copy()
+        batch[RECEIVERS] = chosen
+        batch["collector", "mask"] = chosen.unsqueeze(-1)
+        losses = self.loss(batch)
+        actor = losses["loss_objective"] + losses["loss_entropy"] + losses.get("loss_anchor", 0.0)
+        loss = losses["loss_critic"] if only_critic else actor + losses["loss_critic"]
+        self.optimizer.zero_grad()
+        loss.backward()
+        for group in self.optimizer.param_groups:
+            torch.nn.utils.clip_grad_norm_(group["params"], settings.max_gradient, error_if_nonfinite=True)
+        self.optimizer.step()
+        self.updates_done += 1
+        if not only_critic:
+            self.averaged.update_parameters(self.policy)
+        names = ("loss_objective", "loss_critic", "loss_anchor", "clip_fraction", "kl_approx", "entropy")
+        return {name: losses[name].detach().mean() for name in names if name in losses}
+
+    def state(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
+        """What a checkpoint holds: named tensors, and plain values."""
+        moments = self.optimizer.state_dict()["state"]
+        tensors = {
+            "policy": self.flown.state_dict(),
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "value_norm": self.loss.value_norm.state_dict(),
+            "anchor": self.anchor.state_dict(),
+            "optimizer": {
+                f"{index}.{name}": value for index, entry in moments.items() for name, value in entry.items()
+            },
+        }
+        return tensors, {"updates": self.updates_done, "averaged": int(self.averaged.n_averaged)}
