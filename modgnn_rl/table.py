@@ -19,7 +19,7 @@ __all__ = ["as_markdown", "read_tables", "summarise_flights"]
 YARDSTICK = "LocalReynolds(hops=1)"
 SUMMARISED = ("error", "leader_distance", "cohesion", "separation", "smallest_distance", "near_collisions", "reward")
 ERROR_HEADER = ("flown by", "error", "median", "by quarter", "lost", "diverged")
-SHAPE_HEADER = ("flown by", "leader distance", "cohesion", "separation", "smallest", "touching")
+SHAPE_HEADER = ("flown by", "leader distance", "cohesion", "separation", "smallest", "touching", "reward")
 NOTE = """\
 All rows fly from the same starts behind the same leaders, each to the end. Mean ± standard deviation over flocks
 [95 % confidence interval of the mean]. Error: mean squared error of the action against the expert's, per component,
@@ -27,7 +27,8 @@ over the agents that the policy flies, m^2/s^2; with its median over flocks and 
 Lost: share of flocks in which nobody hears the leader at the end. Diverged: share of flocks in which an agent strayed
 beyond env.max_distance. Leader distance: from the leader to the centre of mass of the others. Cohesion: diameter of the
 smallest enclosing sphere. Separation: distance to the nearest neighbour. Smallest: the smallest distance of any two
-agents in any flight. Touching: pairs within env.collision_distance, mean over time. All distances in m."""
+agents in any flight. Touching: pairs within env.collision_distance, mean over time. Reward: of an agent, summed over
+the flight. All distances in m."""
 
 
 def summarise_flights(flights: Mapping[str, Flights], seed: int) -> dict[str, Any]:
@@ -120,7 +121,9 @@ def _error_cells(row: Mapping[str, Any]) -> list[str]:
 def _shape_cells(row: Mapping[str, Any]) -> list[str]:
     cells = [_spread(row[metric], 2) for metric in ("leader_distance", "cohesion", "separation")]
     alone = row["smallest_distance"] is None
-    return [*cells, "-" if alone else f"{row['smallest_distance_ever']:.2f}", _mean(row["near_collisions"])]
+    smallest = "-" if alone else f"{row['smallest_distance_ever']:.2f}"
+    touching = "-" if row["near_collisions"] is None else f"{row['near_collisions']['mean']:.2g}"
+    return [*cells, smallest, touching, _interval(row["reward"], 1)]
 
 
 def _spread(entry: Mapping[str, float] | None, digits: int) -> str:
@@ -131,5 +134,9 @@ def _spread(entry: Mapping[str, float] | None, digits: int) -> str:
     return f"{mean} ± {std} [{low}, {high}]"
 
 
-def _mean(entry: Mapping[str, float] | None) -> str:
-    return "-" if entry is None else f"{entry['mean']:.2f}"
+def _interval(entry: Mapping[str, float] | None, digits: int) -> str:
+    """Mean [confidence interval]."""
+    if entry is None:
+        return "-"
+    mean, low, high = (f"{entry[key]:.{digits}f}" for key in ("mean", "low", "high"))
+    return f"{mean} [{low}, {high}]"

@@ -85,7 +85,7 @@ def bc(
             if training and index % -(-rounds // parts) == 0:
                 for group in training:
                     group.disturbance.scale = noise
-                    group.keep(journal.show(index, group.fly(expert_share=1.0)))
+                    group.keep(journal.show(index + 1, group.fly(expert_share=1.0)))
             metrics = {"learning_rate": learners[0].learning_rate, "noise": noise}
             losses = []
             for buffer, unseen in zip(buffers, validation, strict=True):
@@ -97,7 +97,7 @@ def bc(
                 for name, values in found.items():
                     metrics |= _named(by_name, f"{unseen.num_agents}/{name}", values)
                 if (index + 1) % FLIGHT_ROUNDS == 0:
-                    metrics |= _errors_in_flight(config, by_name, unseen.num_agents)
+                    metrics |= _errors_in_flight(config, by_name, unseen.num_agents, expert)
             loss = sum(losses) / len(losses)
             noise = loss**0.5 if settings.dart else noise
             if journal.note(index + 1, metrics, fitting * len(sizes), validation_loss=loss):
@@ -106,7 +106,8 @@ def bc(
     if len(members) > 1:
         for name, member in members.items():
             own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
-            save_checkpoint(own.checkpoints, updates, {"policy": by_name[name].flown.state_dict()}, {})
+            learner = by_name[name]
+            save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.flown.state_dict()}, {})
     return dict(zip(by_name, policies, strict=True))
 
 
@@ -117,7 +118,9 @@ def _named(by_name: dict[str, Any], metric: str, values: Sequence[float]) -> dic
     return {f"{name}/{metric}": value for name, value in zip(by_name, values, strict=True)}
 
 
-def _errors_in_flight(config: TrainConfig, by_name: dict[str, Any], size: int) -> dict[str, float]:
+def _errors_in_flight(
+    config: TrainConfig, by_name: dict[str, Any], size: int, expert: TensorDictModuleBase
+) -> dict[str, float]:
     """The error of each policy on short flights of its own, from the same starts."""
     settings: BCConfig = config.trainer
     flights = [
@@ -129,6 +132,7 @@ def _errors_in_flight(config: TrainConfig, by_name: dict[str, Any], size: int) -
             steps=min(FLIGHT_STEPS, settings.cloning_steps),
             seed=derive_seed(config.seed, "validation"),
             device=config.device,
+            expert=expert,
         )
         for learner in by_name.values()
     ]

@@ -60,15 +60,16 @@ class FlockCollector:
             num_envs, num_agents, config=config, seed=derive_seed(seed, "env"), device=device, stagger=True
         )
         self.noise = torch.Generator().manual_seed(derive_seed(seed, "noise"))
-        self.collector = Collector(
-            self.env,
-            TensorDictSequential(*behaviour),
-            frames_per_batch=num_envs * steps,
-            total_frames=-1,
-            auto_register_policy_transforms=True,
-            trust_policy=True,
-            no_cuda_sync=True,
-        )
+        with torch.random.fork_rng():  # the collector tries the policy out
+            self.collector = Collector(
+                self.env,
+                TensorDictSequential(*behaviour),
+                frames_per_batch=num_envs * steps,
+                total_frames=-1,
+                auto_register_policy_transforms=True,
+                trust_policy=True,
+                no_cuda_sync=True,
+            )
         self._flights: Iterator[TensorDictBase] = iter(self.collector)
 
     @torch.no_grad()

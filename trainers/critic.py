@@ -58,7 +58,7 @@ def flock_features(state: Tensor, mask: Tensor | None = None) -> Tensor:
 
     Distance, closing speed and difference of the velocities, each with respect to the leader (agent 0) and to the
     flock's mean; the same of the leader to that mean; distance of the nearest agent; how crowded it is around the
-    agent, and how fast it becomes so; speed.
+    agent; speed.
 
     Args:
         state: position, m, and velocity, m/s [*B, N, 6].
@@ -111,7 +111,7 @@ class FlockCritic(TensorDictModuleBase):
         super().__init__()
         self.network = PooledCritic(15, hidden)
         self.state_key, self.mask_key = state, mask
-        self.in_keys: list[NestedKey] = [state]
+        self.in_keys: list[NestedKey] = [state, mask]  # TorchRL's estimators show it nothing else
         self.out_keys: list[NestedKey] = [value]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

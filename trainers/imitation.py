@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.func import functional_call, stack_module_state, vmap
 from torchrl.modules import set_recurrent_mode
@@ -22,23 +23,32 @@ __all__ = [
 ]
 
 
-def imitation_loss(policy: ModGNN, batch: TensorDictBase, receivers: Tensor) -> Tensor:
+EXPERT_ACTION = ("agents", "expert_action")
+
+
+def imitation_loss(
+    policy: ModGNN, batch: TensorDictBase, receivers: Tensor, *, expert_action: NestedKey = EXPERT_ACTION
+) -> Tensor:
     """Mean squared error per component between the policy's and the expert's actions at the end of each window.
 
     Only the receivers' actions at the last step are computed.
 
     Args:
         policy: the policy; run over the window.
-        batch: windows [S, W] with the policy's in-keys and ``("agents", "expert_action")`` [S, W, N, 3].
+        batch: windows [S, W] with the policy's in-keys and the expert's action.
         receivers: the agents whose error counts, bool [S, N].
+        expert_action: key of the expert's action [S, W, N, A].
     """
-    wanted = _at_the_end(batch, receivers)
+    expert = batch[expert_action]
+    wanted = _at_the_end(expert, receivers)
     with set_recurrent_mode(True):
-        action = policy(batch.copy(), receivers=wanted)["agents", "action"]
-    return (action - batch["agents", "expert_action"])[wanted].square().mean()
+        action = policy(batch.copy(), receivers=wanted)[policy.out_keys[0]]
+    return (action - expert)[wanted].square().mean()
 
 
-def stacked_losses(policies: Sequence[ModGNN], batch: TensorDictBase, receivers: Tensor) -> list[Tensor]:
+def stacked_losses(
+    policies: Sequence[ModGNN], batch: TensorDictBase, receivers: Tensor, *, expert_action: NestedKey = EXPERT_ACTION
+) -> list[Tensor]:
     """`imitation_loss` of policies that differ in their weights only, computed at once (``torch.func.vmap``).
 
     The gradients are added to those that the weights hold.
@@ -47,17 +57,18 @@ def stacked_losses(policies: Sequence[ModGNN], batch: TensorDictBase, receivers:
         policies: P of them.
         batch: windows [S, W], see `imitation_loss`.
         receivers: the agents whose error counts, bool [S, N].
+        expert_action: key of the expert's action [S, W, N, A].
 
     Returns:
         the P losses, without gradient.
     """
-    wanted = _at_the_end(batch, receivers)
-    expert = batch["agents", "expert_action"]
+    expert = batch[expert_action]
+    wanted = _at_the_end(expert, receivers)
     weights, buffers = stack_module_state(list(policies))
 
     def loss_of(weights: dict[str, Tensor], buffers: dict[str, Tensor]) -> Tensor:
         result = functional_call(policies[0], (weights, buffers), (batch.copy(),), {"receivers": wanted})
-        difference = torch.where(wanted.unsqueeze(-1), result["agents", "action"] - expert, 0.0)
+        difference = torch.where(wanted.unsqueeze(-1), result[policies[0].out_keys[0]] - expert, 0.0)
         return difference.square().sum() / (wanted.sum() * expert.shape[-1])
 
     with set_recurrent_mode(True):
@@ -86,9 +97,9 @@ def hide_velocities(batch: TensorDictBase, share: float, generator: torch.Genera
     batch["agents", "observation"] = observation.masked_fill(hidden, 0.0)
 
 
-def _at_the_end(batch: TensorDictBase, receivers: Tensor) -> Tensor:
-    """The receivers [S, N] at the last step of windows, bool [S, W, N]."""
-    wanted = torch.zeros_like(batch["agents", "controlled"])
+def _at_the_end(actions: Tensor, receivers: Tensor) -> Tensor:
+    """The receivers [S, N] at the last step of windows, which actions [S, W, N, A] are of; bool [S, W, N]."""
+    wanted = torch.zeros_like(actions[..., 0], dtype=torch.bool)
     wanted[:, -1] = receivers
     return wanted
 

@@ -29,7 +29,7 @@ from modgnn_rl.trainers.imitation import (
 
 __all__ = ["Learner", "cosine_learning_rate", "fit_together", "validate_together"]
 
-STACKED_PAIRS = 4096  # up to this many pairs of agents in a batch, several seeds learn faster as one
+STACKED_PAIRS = 2048  # up to this many pairs of agents in a batch, several seeds learn faster as one
 
 
 class Learner:

@@ -1,0 +1,161 @@
+"""DAgger on a VMAS scenario, with an expert of one's own: robots that pass each other without a collision.
+
+    pip install vmas
+    python examples/imitate_on_vmas.py
+
+In VMAS' "navigation", each robot has a goal and loses reward for touching another. The expert below sees everybody: it
+steers for its goal, and keeps to the right of whoever is near, whose velocity and goal it knows. The policy hears of
+these from its neighbours only, one step late. The mixture of both flies, the expert labels every state, and the policy
+learns from all of them. With ``--hops 0`` nobody hears anybody.
+
+All keys have names of their own here, ``robots``, to show where they are given.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv, UnaryTransform, VmasEnv
+from torchrl.modules import get_primers_from_module
+
+from modgnn_rl import ModGNN, ModGNNLayer
+from modgnn_rl.models import mlp
+from modgnn_rl.trainers.collection import as_windows
+from modgnn_rl.trainers.imitation import imitation_loss, random_receivers
+from modgnn_rl.trainers.mixing import Mixture
+
+OBSERVATION, ACTION, EXPERT = ("robots", "observation"), ("robots", "action"), ("robots", "expert")
+COMM_RANGE, REACH = 1.0, 0.5  # m; who is heard, and who is made way for
+
+
+def neighbours(observation: Tensor) -> Tensor:
+    """Adjacency of robots that are near each other: [*B, N, 6] -> bool [*B, N, N]."""
+    position = observation[..., :2]
+    distance = torch.cdist(position, position)
+    return (distance < COMM_RANGE) & ~torch.eye(position.shape[-2], dtype=torch.bool, device=position.device)
+
+
+def make_env(num_envs: int, num_agents: int, steps: int, seed: int) -> TransformedEnv:
+    """VMAS' navigation: position, velocity and offset from the goal are observed, but no rays."""
+    robots = {"robots": [f"agent_{number}" for number in range(num_agents)]}
+    env = VmasEnv("navigation", num_envs=num_envs, seed=seed, group_map=robots, n_agents=num_agents, shared_rew=False)
+    return TransformedEnv(
+        env,
+        Compose(
+            UnaryTransform([OBSERVATION], [OBSERVATION], fn=lambda observation: observation[..., :6]),
+            UnaryTransform([OBSERVATION], ["adjacency"], fn=neighbours),
+            StepCounter(steps),
+            InitTracker(),
+        ),
+    )
+
+
+def keep_right(observation: Tensor) -> Tensor:
+    """The expert: accelerations [*B, N, 2] towards the goals, away from and to the right of others that are near."""
+    position, velocity, offset = observation.split(2, -1)
+    apart = position.unsqueeze(-2) - position.unsqueeze(-3)
+    distance = apart.norm(dim=-1, keepdim=True).clamp(min=1e-3)
+    away = apart / distance
+    right = torch.stack((-away[..., 1], away[..., 0]), -1)
+    others = 1 - torch.eye(position.shape[-2]).unsqueeze(-1)
+    force = (others * (REACH / distance - 1).clamp(min=0) * (away + right)).sum(-2)
+    return (force - 3 * offset - 2 * velocity).clamp(-1, 1)
+
+
+def make_policy(hops: int, hidden: int = 64) -> ModGNN:
+    """Networks for what a robot knows itself, without its position, for what each neighbour says, and for the sum."""
+    own = nn.Sequential(HidePosition(), mlp(6, hidden, hidden))
+    f_pre = [own, *(mlp(6, hidden, hidden) for _ in range(hops))]
+    f_final = nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2), nn.Hardtanh())
+    return ModGNN(ModGNNLayer(hops, f_pre=f_pre, f_final=f_final), observation=OBSERVATION, action=ACTION)
+
+
+class HidePosition(nn.Module):
+    """Zero the position."""
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Keep velocity and offset from the goal: [..., 6] -> [..., 6]."""
+        return nn.functional.pad(observation[..., 2:], (2, 0))
+
+
+@torch.no_grad()
+def fly(pilot: TensorDictModuleBase, num_envs: int, num_agents: int, steps: int) -> tuple[float, float]:
+    """Error of the pilot's actions against the expert's, and return of a robot, on episodes of the pilot's own."""
+    torch.manual_seed(1)
+    env = make_env(num_envs, num_agents, steps, seed=1)
+    primer = get_primers_from_module(pilot, warn=False)
+    if primer is not None:
+        env.append_transform(primer)
+    flights = env.rollout(steps, pilot, break_when_any_done=False)
+    difference = flights[ACTION] - keep_right(flights[OBSERVATION])
+    ended = flights["next", "done"].cumsum(1) - flights["next", "done"].long() > 0
+    reward = torch.where(ended.unsqueeze(-1), 0.0, flights["next", "robots", "reward"])
+    return difference.square().mean().item(), reward.sum(1).mean().item()
+
+
+def main(
+    hops: int = 1,
+    num_envs: int = 64,
+    num_agents: int = 4,
+    steps: int = 100,
+    rounds: int = 12,
+    updates: int = 100,
+    seed: int = 0,
+) -> dict[str, tuple[float, float]]:
+    """Train.
+
+    Returns:
+        error and return of the policy before and after training, and of the expert.
+    """
+    torch.manual_seed(seed)
+    policy, expert = make_policy(hops), TensorDictModule(keep_right, [OBSERVATION], [EXPERT])
+    size = (num_envs, num_agents, steps)
+    results = {"policy before": fly(policy, *size)}
+    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
+    mixture = Mixture(1.0, steps, generator, action=ACTION, expert_action=EXPERT)
+    collector = Collector(
+        make_env(*size, seed),
+        TensorDictSequential(policy, expert, mixture),
+        frames_per_batch=num_envs * steps,
+        total_frames=num_envs * steps * rounds,
+        auto_register_policy_transforms=True,  # makes the messages recurrent state of the environment
+    )
+    buffer = ReplayBuffer(storage=LazyTensorStorage(num_envs * steps * rounds), batch_size=256)
+    optimiser = torch.optim.Adam(policy.parameters(), lr=1e-3)
+    everybody = torch.ones(256, num_agents, dtype=torch.bool)
+
+    for number, flights in enumerate(collector):
+        mixture.share = 0.5 ** (number + 1)  # the expert's in the next round
+        data = flights.select(*policy.in_keys, EXPERT, strict=False)
+        buffer.extend(as_windows(data, policy.window, every=1))
+        losses = []
+        for _ in range(updates):
+            loss = imitation_loss(policy, buffer.sample(), everybody, expert_action=EXPERT)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            losses.append(loss.item())
+        print(f"round {number + 1}: loss {sum(losses) / updates:.4f}")
+    results["policy"] = fly(policy, *size)
+    results["expert"] = fly(TensorDictModule(keep_right, [OBSERVATION], [ACTION]), *size)
+    for name, (error, total) in results.items():
+        print(f"{name}: error {error:.4f}, return {total:.3f}")
+    return results
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hops", type=int, default=1, help="communication hops K")
+    parser.add_argument("--num-envs", type=int, default=64)
+    parser.add_argument("--num-agents", type=int, default=4)
+    parser.add_argument("--steps", type=int, default=100, help="length of an episode")
+    parser.add_argument("--rounds", type=int, default=12)
+    parser.add_argument("--updates", type=int, default=100, help="gradient steps in each round")
+    parser.add_argument("--seed", type=int, default=0)
+    main(**vars(parser.parse_args()))
