@@ -14,6 +14,7 @@ from modgnn_rl.communication import GraphShift
 __all__ = ["Moments", "PairForce", "VectorSquash", "is_equivariant", "mlp"]
 
 VELOCITY_SCALE = 1.4  # s/m
+SOFTENING = 1e-8
 MANY = 8.0  # sums over about this many neighbours are brought to order one
 
 
@@ -63,47 +64,43 @@ class PairForce(nn.Module):
             vectors (one: the force, m/s), then scalars [E, 3 V + S].
         """
         # Components first: sums over three numbers in a row are several times slower.
-        offset, drift = relative[..., :6].movedim(-1, 0).contiguous().split(3)
-        velocity = own[..., 3:6].movedim(-1, 0).contiguous()
+        ends = [data.movedim(-1, 0).contiguous() for data in (relative, own)]
+        offset, drift, velocity = ends[0][:3], ends[0][3:6], ends[1][3:6]
         distance, drift_speed, own_speed = _norm(offset), _norm(drift), _norm(velocity)
         unit = offset / distance
         invariants = [
-            0.7 * distance - 1.2,
-            (distance + 0.05).log(),
-            VELOCITY_SCALE * drift_speed,
-            VELOCITY_SCALE * _dot(unit, drift),
-            VELOCITY_SCALE * own_speed,
-            VELOCITY_SCALE * _dot(velocity, unit),
-            _dot(velocity, drift),
+            torch.stack(
+                [
+                    0.7 * distance - 1.2,
+                    (distance + 0.05).log(),
+                    VELOCITY_SCALE * drift_speed,
+                    VELOCITY_SCALE * _dot(unit, drift),
+                    VELOCITY_SCALE * own_speed,
+                    VELOCITY_SCALE * _dot(velocity, unit),
+                    _dot(velocity, drift),
+                ]
+            )
         ]
-        basis = [unit, drift, velocity]
-        for outputs in (relative, own):
-            vectors, scalars = self._of_earlier_layers(outputs)
-            for vector in vectors:
-                invariants += [_norm(vector), _dot(vector, unit), _dot(vector, drift), _dot(vector, velocity)]
-            basis += vectors
-            invariants += scalars
-        coefficients = self.network(torch.stack(invariants, -1)).unbind(-1)
-        results = []
-        for number in range(self.vectors):
-            own_coefficients = coefficients[number * len(basis) : (number + 1) * len(basis)]
-            force = own_coefficients[0] * unit
-            for coefficient, vector in zip(own_coefficients[1:], basis[1:], strict=True):
-                force = force + coefficient * vector
-            results.append(force)
-        results += [scalar.unsqueeze(0) for scalar in coefficients[self.vectors * len(basis) :]]
+        basis = [torch.stack([unit, drift, velocity])]
+        further = [self._of_earlier_layers(end[6:]) for end in ends] if self.earlier else []
+        for vectors, scalars in further:
+            lengths = (vectors.square().sum(1) + SOFTENING).sqrt()
+            products = [(vectors * other).sum(1) for other in (unit, drift, velocity)]
+            invariants += [torch.stack([lengths, *products], 1).flatten(0, 1), scalars]
+            basis.append(vectors)
+        numbers = torch.cat(invariants).movedim(0, -1)
+        coefficients = self.network(numbers).movedim(-1, 0).contiguous()
+        directions = torch.cat(basis)
+        weights = coefficients[: self.vectors * len(directions)].unflatten(0, (self.vectors, -1))
+        forces = (weights.unsqueeze(2) * directions).sum(1).flatten(0, 1)
+        results = [forces, coefficients[self.vectors * len(directions) :]] if self.scalars else [forces]
         return torch.cat(results).movedim(0, -1)
 
-    def _of_earlier_layers(self, outputs: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """Vectors [3, E] and scalars [E] that earlier layers put out behind position and velocity."""
-        vectors: list[Tensor] = []
-        scalars: list[Tensor] = []
-        if self.earlier:
-            count, width = self.features[0], 3 * self.features[0] + self.features[1]
-            for block in outputs[..., 6:].movedim(-1, 0).contiguous().split(width):
-                vectors += block[: 3 * count].split(3) if count else ()
-                scalars += block[3 * count :].unbind(0)
-        return vectors, scalars
+    def _of_earlier_layers(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Vectors [L C, 3, E] and scalars [L S, E] in what L earlier layers put out [L (3 C + S), E]."""
+        count = self.features[0]
+        blocks = outputs.unflatten(0, (self.earlier, -1))
+        return blocks[:, : 3 * count].unflatten(1, (count, 3)).flatten(0, 1), blocks[:, 3 * count :].flatten(0, 1)
 
 
 class Moments(nn.Module):
@@ -193,4 +190,4 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 def _norm(vector: Tensor) -> Tensor:
     """Lengths [...] of vectors [3, ...], softened so that the gradient exists at zero."""
-    return (_dot(vector, vector) + 1e-8).sqrt()
+    return (_dot(vector, vector) + SOFTENING).sqrt()

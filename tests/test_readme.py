@@ -30,7 +30,8 @@ def test_each_block_on_the_readme_runs(block):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_the_blocks_of_a_page_run_one_after_the_other(page):
+def test_the_blocks_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where runs go
     names: dict[str, object] = {}
     for block in python_of(page):
         exec(compile(block, str(page), "exec"), names)

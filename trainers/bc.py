@@ -23,14 +23,13 @@ from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.collection import Flocks, flocks_of_all_sizes
 from modgnn_rl.trainers.journal import Journal
 from modgnn_rl.trainers.learner import fit_together, validate_together
-from modgnn_rl.trainers.setup import make_learner, side_by_side
+from modgnn_rl.trainers.setup import DART_PARTS, make_learner, side_by_side
 
 __all__ = ["bc"]
 
 ROUNDS = 40  # parts of the training after each of which the loss is looked at
 FLIGHT_ROUNDS = 20  # parts after which the policies fly
 FLIGHT_STEPS = 250  # how long
-DART_PARTS = 4  # parts of the flights between which the noise is set anew
 
 
 def bc(

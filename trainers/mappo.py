@@ -66,7 +66,8 @@ def mappo(
         run, logger, {name: learner}, flocks, settings.iterations, settings, callbacks, unit="rounds"
     ) as journal:
         for index in range(settings.iterations):
-            anchor = anchor_weight(index - settings.critic_warmup, settings.anchor, settings.anchor_rounds)
+            start = 0.0 if config.init_from is None else settings.anchor  # a fresh policy is nothing to stay near to
+            anchor = anchor_weight(index - settings.critic_warmup, start, settings.anchor_rounds)
             metrics = {"noise": learner.actor.noise, "anchor": anchor}
             for group in flocks:
                 flights = journal.show(index + 1, group.continue_flights())

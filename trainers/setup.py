@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections.abc import Sequence
 
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, ModelConfig, TrainConfig, TrainerConfig, as_list
+from modgnn_rl.configs.schema import (
+    BCConfig,
+    DAggerConfig,
+    MAPPOConfig,
+    ModelConfig,
+    TrainConfig,
+    TrainerConfig,
+    as_list,
+)
 from modgnn_rl.dataset import FlightDataset
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
@@ -14,9 +23,12 @@ from modgnn_rl.models import configured_model
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.seeds import derive_seed
+from modgnn_rl.trainers.collection import window_of
 from modgnn_rl.trainers.learner import Learner
 
-__all__ = ["check_training", "initial_policy", "make_learner", "settle_model", "side_by_side"]
+__all__ = ["DART_PARTS", "check_training", "initial_policy", "make_learner", "settle_model", "side_by_side"]
+
+DART_PARTS = 4  # parts of the flights between which the noise is set anew
 
 
 def make_learner(config: TrainConfig, updates: tuple[int, int], member: int = 0) -> Learner:
@@ -66,9 +78,14 @@ def settle_model(config: TrainConfig) -> TrainConfig:
     """The settings with the model of the run that training begins with, or the first of several trained side by side.
 
     Raises:
-        InputError: no readable run ``config.init_from``, or another model was asked for.
+        InputError: no readable run ``config.init_from``, or another model was asked for, or several.
     """
     if isinstance(config.trainer, BCConfig) and (config.trainer.models, config.trainer.hops) != (None, None):
+        if config.init_from is not None:
+            raise InputError(
+                "trainer.models and trainer.hops name fresh policies, init_from one that is there; leave out the one or "
+                "the other"
+            )
         return dataclasses.replace(config, model=next(iter(side_by_side(config).values())).model)
     if config.init_from is None:
         return config
@@ -89,13 +106,33 @@ def _members(config: TrainConfig) -> list[TrainConfig]:
     return list(side_by_side(config).values()) if isinstance(settings, BCConfig) else [config]
 
 
+def _check_flights(settings: TrainerConfig, policies: Sequence[ModGNN]) -> None:
+    """Refuse flights shorter than the windows that are cut from them."""
+    if isinstance(settings, MAPPOConfig):
+        policy = policies[0]
+        name, steps = "round_steps", settings.round_steps
+        needed = 1 if policy.sends_plain_data else policy.hops + settings.window
+    elif isinstance(settings, DAggerConfig):
+        name, steps, needed = "round_steps", settings.round_steps, window_of(policies, settings)
+    elif isinstance(settings, BCConfig) and not settings.dataset:
+        parts = DART_PARTS if settings.dart else 1
+        name, steps, needed = "cloning_steps", settings.cloning_steps, parts * window_of(policies, settings)
+    else:
+        return
+    if steps < needed:
+        raise InputError(
+            f"trainer.{name}={steps} is too short for this model, whose messages are made anew from the steps before; "
+            f"it needs at least {needed}"
+        )
+
+
 def check_training(config: TrainConfig) -> None:
     """Refuse what the ranges of single settings do not, before anything is created.
 
     Raises:
         InputError: sizes that repeat or hold no agent to train, too few updates for the sizes, a model with nothing to
-            learn, several policies that would begin alike, agents that do not fit into the ball they start in, or a
-            dataset that is damaged or does not fit.
+            learn, several policies that would begin alike, flights too short to learn from, agents that do not fit into
+            the ball they start in, or a dataset that is damaged or does not fit.
     """
     settings: TrainerConfig = config.trainer
     sizes = config.env.sizes
@@ -111,9 +148,12 @@ def check_training(config: TrainConfig) -> None:
         raise InputError(
             "several policies cannot all begin with that of init_from, and stay alike: leave it out, or train one"
         )
-    for member in _members(config):
-        if not list(initial_policy(member).parameters()):
+    members = _members(config)
+    policies = [initial_policy(member) for member in members]
+    for member, policy in zip(members, policies, strict=True):
+        if not list(policy.parameters()):
             raise InputError(f"model.name={member.model.name} with model.hops={member.model.hops} has nothing to learn")
+    _check_flights(settings, policies)
     for size in sizes:
         with contextlib.closing(FlockingEnv(1, size, config=config.env, seed=config.seed)) as env:
             env.reset()

@@ -1,0 +1,220 @@
+"""MAPPO as a whole run: what it begins with, what it leaves, what it refuses; and that it learns."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from modgnn_rl import load_policy, training
+from modgnn_rl.checkpoint import load_checkpoint
+from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
+from modgnn_rl.errors import InputError
+from modgnn_rl.evaluation import fly
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.trainers.actor import GaussianActor
+from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.mappo import anchor_weight
+from modgnn_rl.trainers.setup import initial_policy, settle_model
+from modgnn_rl.training import train
+
+WORLD = FlockingConfig(num_agents=4, max_steps=15)
+
+
+@pytest.fixture(autouse=True)
+def _without_evaluation(monkeypatch):
+    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+
+
+def _config(runs, *, env=WORLD, model=None, init_from=None, seed=0, name=None, **settings):
+    small = {"num_envs": 1, "iterations": 3, "round_steps": 8, "critic_warmup": 1, "epochs": 2, "batches": 2}
+    trainer = MAPPOConfig(**{**small, "critic_hidden": 8, "window": 3, **settings})
+    models = {} if model is None else {"model": model}
+    return TrainConfig(
+        env=env, trainer=trainer, runs=str(runs), init_from=init_from, seed=seed, name=name, threads=1, **models
+    )
+
+
+@pytest.fixture(scope="module")
+def cloned(tmp_path_factory):
+    """The run folder of a policy that was cloned a little."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+        trainer = BCConfig(num_envs=1, batch_size=16, cloning_steps=20, cloning_updates=20, held_out=1, averaging=0.5)
+        model = ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
+        return train(
+            TrainConfig(env=WORLD, model=model, trainer=trainer, runs=str(tmp_path_factory.mktemp("runs")), threads=1)
+        )
+
+
+def _scores(policy):
+    flights = fly(policy, WORLD, num_agents=4, num_flocks=3, steps=12, seed=5)
+    return torch.cat((flights.error, flights.reward, flights.cohesion))
+
+
+def test_training_begins_with_exactly_the_policy_of_the_other_run(cloned, tmp_path):
+    config = settle_model(_config(tmp_path, init_from=str(cloned.path)))
+    policy, expected = initial_policy(config), _scores(load_policy(cloned.path))
+    assert config.model == ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
+    assert torch.equal(_scores(policy), expected)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(_scores(GaussianActor(policy)), expected)
+    fresh = settle_model(_config(tmp_path, model=ModelConfig(name="modgnn_mlp", hops=2, hidden=8)))
+    assert not torch.equal(_scores(initial_policy(fresh)), expected)
+
+
+def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_with(cloned, tmp_path):
+    run = train(_config(tmp_path, init_from=str(cloned.path), iterations=2, critic_warmup=2))
+    assert run.config["model"]["name"] == "modgnn_mlp"
+    assert torch.equal(_scores(load_policy(run.path)), _scores(load_policy(cloned.path)))
+
+
+@pytest.mark.parametrize("model", [ModelConfig(hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)])
+def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, model):
+    runs = []
+    for number, seed in enumerate((1, 1, 2)):
+        torch.manual_seed(number)
+        before = torch.get_rng_state()
+        runs.append(train(_config(tmp_path, model=model, seed=seed, name=f"run{number}")))
+        assert torch.equal(torch.get_rng_state(), before)
+    metrics = [run.metrics_file.read_bytes() for run in runs]
+    assert metrics[0] == metrics[1] != metrics[2]
+
+
+def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
+    run = train(_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15)))
+    checkpoint = load_checkpoint(run.checkpoints)
+    assert set(checkpoint.tensors) == {"policy", "actor", "critic", "value_norm", "anchor", "optimizer", "generators"}
+    drawn = {"env", "faults", "noise"}
+    names = {f"{number}.{size}.{name}" for number, size in enumerate((3, 5)) for name in drawn}
+    assert set(checkpoint.tensors["generators"]) == {"learner", *names}
+    assert checkpoint.step == checkpoint.state["updates"] == 3 * 2 * 4  # rounds, sizes, updates
+    assert checkpoint.state["averaged"] == 2 * 2 * 4  # but for the critic's first round
+    assert checkpoint.state["config"] == run.config
+    weights = load_policy(run.path).state_dict()
+    assert all(torch.equal(value, weights[name]) for name, value in checkpoint.tensors["policy"].items())
+
+
+def test_each_size_has_metrics_of_its_own(tmp_path):
+    metrics = train(_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15))).read_metrics()
+    assert [line["step"] for line in metrics] == [1, 2, 3]
+    common = ("reward", "cost/leader", "cost/effort", "error", "cohesion", "loss_critic", "kl_approx", "entropy")
+    assert all({f"{size}/{name}" for size in (3, 5) for name in common} <= set(line) for line in metrics)
+    assert [("3/loss_anchor" in line) for line in metrics] == [False, True, True]
+    assert [line["anchor"] for line in metrics] == pytest.approx([0.1, 0.1, 0.1 * 74 / 75])
+    assert metrics[0]["noise"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        FlockingConfig(num_agents=4, graph="links"),
+        FlockingConfig(num_agents=4, dropout_rate=2.0, dropout_time=0.2),
+        FlockingConfig(num_agents=4, position_noise=0.1, delay=2),
+        FlockingConfig(num_agents=2),
+    ],
+)
+@pytest.mark.parametrize("model", [ModelConfig(hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)])
+def test_it_flies_in_every_world(tmp_path, env, model):
+    for line in train(_config(tmp_path, env=env, model=model)).read_metrics():
+        assert all(value == value for name, value in line.items() if "separation" not in name), line
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"init_from": "."}, "is no run folder"),
+        ({"init_from": "nowhere"}, "is no run folder"),
+        ({"model": ModelConfig(name="gcn")}, r"name='gcn'.* is not that of init_from=.*name='modgnn_mlp', hops=2"),
+        ({"trainer": BCConfig(seeds=2)}, "several policies cannot all begin with that of init_from"),
+        ({"trainer": BCConfig(models=["gcn"])}, "trainer.models and trainer.hops name fresh policies"),
+        ({"trainer": BCConfig(hops=[1])}, "trainer.models and trainer.hops name fresh policies"),
+        ({"trainer": DAggerConfig(gate="ensemble")}, "several policies cannot all begin with that of init_from"),
+    ],
+)
+def test_a_beginning_that_cannot_be_is_refused_before_anything_is_created(
+    cloned, tmp_path, monkeypatch, change, message
+):
+    monkeypatch.chdir(tmp_path)
+    config = _config(tmp_path / "runs", init_from=str(cloned.path))
+    for name, value in change.items():
+        setattr(config, name, value)
+    with pytest.raises(InputError, match=message):
+        train(config)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("trainer", "message"),
+    [
+        (MAPPOConfig(round_steps=11, window=10), "round_steps=11 is too short .* at least 12"),
+        (DAggerConfig(round_steps=2), "round_steps=2 is too short .* at least 3"),
+        (BCConfig(cloning_steps=2), "cloning_steps=2 is too short .* at least 3"),
+        (BCConfig(cloning_steps=11, dart=True), "cloning_steps=11 is too short .* at least 12"),
+    ],
+)
+def test_flights_that_hold_no_window_are_refused_before_anything_is_created(tmp_path, trainer, message):
+    """Learned messages of two layers are made anew from two steps before."""
+    config = _config(tmp_path / "runs", model=ModelConfig(name="mpnn", layers=2))
+    config.trainer = trainer
+    with pytest.raises(InputError, match=message):
+        train(config)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_anchor_fades_linearly_after_the_warm_up():
+    assert [anchor_weight(index, 0.2, 4) for index in range(-2, 7)] == pytest.approx(
+        [0.2, 0.2, 0.2, 0.15, 0.1, 0.05, 0, 0, 0]
+    )
+    assert [anchor_weight(index, 0.2, 0) for index in (-1, 0, 1000)] == [0.2] * 3
+
+
+def test_callbacks_can_stop_it(tmp_path):
+    class Stop(Callback):
+        def on_round(self, index, metrics):
+            return index == 2
+
+    assert [line["step"] for line in train(_config(tmp_path), callbacks=[Stop()]).read_metrics()] == [1, 2]
+
+
+def test_the_command_trains_on(cloned, tmp_path):
+    """As a user runs it: from the run folder of a cloned policy, with the trainer's own YAML."""
+    small = ["num_envs=1", "iterations=1", "round_steps=4", "epochs=1", "batches=1", "critic_hidden=8"]
+    command = [sys.executable, "-m", "modgnn_rl.train", "trainer=mappo", f"init_from={cloned.path}"]
+    command += [f"trainer.{setting}" for setting in small]
+    command += ["env.num_agents=3", "evaluation.num_flocks=2", "evaluation.steps=4"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert "mappo-modgnn_mlp" in folder.name
+    assert RunFolder.open(folder).config["model"]["hops"] == 2
+    assert "modgnn_mlp" in json.loads((folder / "evaluation.json").read_text())["3"]["rows"]
+
+
+@pytest.mark.slow
+def test_from_scratch_the_reward_rises(tmp_path):
+    env = FlockingConfig(num_agents=3, max_steps=200)
+    run = train(
+        _config(
+            tmp_path,
+            env=env,
+            model=ModelConfig(hidden=16),
+            num_envs=2,
+            iterations=30,
+            round_steps=32,
+            critic_warmup=2,
+            epochs=4,
+            batches=4,
+            learning_rate=3e-3,
+            anchor=0.0,
+            discount=0.95,
+        )
+    )
+    rewards = [line["3/reward"] for line in run.read_metrics()]
+    assert sum(rewards[-5:]) / 5 > sum(rewards[:5]) / 5 + 0.05
