@@ -35,8 +35,8 @@ __all__ = [
 
 
 MODEL_NAMES = (
-    "pair_force",
     "moment_force",
+    "pair_force",
     "modgnn_mlp",
     "no_pre",
     "no_mid",
@@ -193,7 +193,7 @@ WorldChanges = make_dataclass(
 class ModelConfig:
     """The policy: one of the models of `modgnn_rl.models`."""
 
-    name: str = setting("pair_force", "model", choices=MODEL_NAMES)
+    name: str = setting("moment_force", "model", choices=MODEL_NAMES)
     hops: int = setting(1, "communication hops K of each layer", low=0)
     layers: int | None = setting(
         None, "layers; with several, agents hear of others over layers x hops links; null: the model's own", low=1
@@ -274,7 +274,7 @@ class DAggerConfig(ImitationConfig):
     name: str = setting("dagger", "trainer", choices=("dagger",))
     cloning_steps: int = setting(200, "steps that the expert flies at first", low=1)
     cloning_updates: int = setting(400, "updates on its flights, shared by the sizes", low=0)
-    rounds: int = setting(120, "rounds of flying and fitting", low=0)
+    rounds: int = setting(80, "rounds of flying and fitting", low=0)
     round_steps: int = setting(40, "steps flown in a round", low=1)
     round_updates: int = setting(60, "updates in a round, shared by the sizes", low=1)
     schedule: str = setting(
@@ -310,7 +310,7 @@ class MAPPOConfig(TrainerConfig):
         "agents of a state of 32 that count in an update; at other sizes N, as many links: 32 / N times as many agents",
         low=1,
     )
-    iterations: int = setting(150, "rounds of flying and improving", low=0)
+    iterations: int = setting(100, "rounds of flying and improving", low=0)
     round_steps: int = setting(50, "steps flown in a round", low=2)
     critic_warmup: int = setting(10, "rounds at first in which only the critic learns", low=0)
     epochs: int = setting(4, "passes over the flights of a round", low=1)
@@ -327,7 +327,7 @@ class MAPPOConfig(TrainerConfig):
     anchor: float = setting(
         0.1, "weight of the divergence (KL) from the policy that training began with, in the first round", low=0
     )
-    anchor_rounds: int = setting(75, "rounds over which that weight fades to zero; 0: it stays", low=0)
+    anchor_rounds: int = setting(50, "rounds over which that weight fades to zero; 0: it stays", low=0)
 
 
 @dataclass

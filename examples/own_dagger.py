@@ -56,7 +56,7 @@ def main(
     num_envs: int = 32,
     num_agents: int = 16,
     steps: int = 40,
-    rounds: int = 30,
+    rounds: int = 16,
     updates: int = 60,
     test_steps: int = 240,
     seed: int = 0,
@@ -102,7 +102,7 @@ if __name__ == "__main__":
     parser.add_argument("--num-envs", type=int, default=32, help="flocks flown at once")
     parser.add_argument("--num-agents", type=int, default=16, help="agents in each, the leader included")
     parser.add_argument("--steps", type=int, default=40, help="steps flown in each round")
-    parser.add_argument("--rounds", type=int, default=30)
+    parser.add_argument("--rounds", type=int, default=16)
     parser.add_argument("--updates", type=int, default=60, help="gradient steps in each round")
     parser.add_argument("--test-steps", type=int, default=240, help="steps of the flights that are tested on")
     parser.add_argument("--seed", type=int, default=0)

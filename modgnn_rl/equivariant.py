@@ -86,13 +86,13 @@ class PairForce(nn.Module):
         for vectors, scalars in further:
             lengths = (vectors.square().sum(1) + SOFTENING).sqrt()
             products = [(vectors * other).sum(1) for other in (unit, drift, velocity)]
-            invariants += [torch.stack([lengths, *products], 1).flatten(0, 1), scalars]
+            invariants += [torch.cat(torch.stack([lengths, *products], 1).unbind()), scalars]
             basis.append(vectors)
         numbers = torch.cat(invariants).movedim(0, -1)
         coefficients = self.network(numbers).movedim(-1, 0).contiguous()
         directions = torch.cat(basis)
         weights = coefficients[: self.vectors * len(directions)].unflatten(0, (self.vectors, -1))
-        forces = (weights.unsqueeze(2) * directions).sum(1).flatten(0, 1)
+        forces = torch.cat((weights.unsqueeze(2) * directions).sum(1).unbind())
         results = [forces, coefficients[self.vectors * len(directions) :]] if self.scalars else [forces]
         return torch.cat(results).movedim(0, -1)
 

@@ -241,8 +241,8 @@ def _sum_of_forces(spec: LayerSpec, vectors: int, scalars: int, features: tuple[
 
 
 MODELS: dict[str, Callable[[LayerSpec], ModGNNLayer | CentralLayer]] = {
-    "pair_force": pair_force,
     "moment_force": moment_force,
+    "pair_force": pair_force,
     "modgnn_mlp": modgnn_mlp,
     "no_pre": no_pre,
     "no_mid": no_mid,

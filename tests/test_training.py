@@ -26,7 +26,9 @@ from modgnn_rl.configs.schema import (
     WorldChanges,
 )
 from modgnn_rl.errors import InputError
+from modgnn_rl.experts import Reynolds
 from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.journal import Journal
 from modgnn_rl.training import evaluate_run, prepare_torch, train
 
@@ -63,7 +65,7 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
         assert f"5/{name}" in metrics[-1]
     assert list(run.checkpoints.iterdir())
     table = json.loads((run.path / "evaluation.json").read_text())["5"]["rows"]
-    rows = ["pair_force", "expert", "LocalReynolds(hops=2)", "LocalReynolds(hops=1)", "zero action"]
+    rows = ["moment_force", "expert", "LocalReynolds(hops=2)", "LocalReynolds(hops=1)", "zero action"]
     assert list(table) == rows
     assert all(row in (run.path / "evaluation.md").read_text() for row in rows)
 
@@ -156,8 +158,8 @@ def test_behaviour_cloning_of_several_sizes(tmp_path, model):
 def test_dagger_learns_to_fly_better_than_the_local_expert(tmp_path):
     run = train(_config(tmp_path, DAggerConfig(), env=FlockingConfig(), evaluation=EvaluationConfig()))
     table = json.loads((run.path / "evaluation.json").read_text())["32"]["rows"]
-    assert table["pair_force"]["error"]["mean"] < 0.09
-    assert table["pair_force"]["error_minus_local"]["high"] < 0
+    assert table["moment_force"]["error"]["mean"] < 0.09
+    assert table["moment_force"]["error_minus_local"]["high"] < 0
 
 
 def test_a_device_that_is_not_there():
@@ -168,7 +170,7 @@ def test_a_device_that_is_not_there():
 def test_a_policy_of_another_model_is_refused(run, tmp_path):
     copy = tmp_path / "copy"
     copy.mkdir()
-    text = (run.path / "config.yaml").read_text().replace("name: pair_force", "name: gcn")
+    text = (run.path / "config.yaml").read_text().replace("name: moment_force", "name: gcn")
     (copy / "config.yaml").write_text(text)
     (copy / "checkpoints").symlink_to(run.checkpoints)
     with pytest.raises(InputError, match="does not fit the model 'gcn'"):
@@ -211,3 +213,32 @@ def test_a_folder_that_is_no_run(tmp_path):
     assert done.returncode == 2
     assert "is no run folder" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("model", ["pair_force", "moment_force", "mpnn"])
+def test_training_goes_on_under_faults_and_learns_from_the_true_state(tmp_path, model):
+    world = FlockingConfig(
+        num_agents=[4, 6],
+        message_loss=0.3,
+        delay=1,
+        position_noise=0.05,
+        velocity_noise=0.05,
+        dropout_rate=1.0,
+        dropout_time=0.2,
+        wind=0.5,
+    )
+    seen = []
+
+    class Watch(Callback):
+        def on_flights(self, index, flights):
+            seen.append(flights.select(("agents", "state"), ("agents", "mask"), ("agents", "expert_action")).clone())
+
+    run = train(_config(tmp_path, _dagger(), env=world, model=ModelConfig(name=model)), callbacks=[Watch()])
+    for flights in seen:
+        agents = flights["agents"]
+        label = Reynolds.for_env(world)(flights.exclude(("agents", "expert_action")))["agents", "expert_action"]
+        there = agents["mask"]
+        torch.testing.assert_close(agents["expert_action"][there], label[there])
+    assert {there.shape[-1] for there in (flights["agents", "mask"] for flights in seen)} == {4, 6}
+    assert not all(bool(flights["agents", "mask"].all()) for flights in seen)  # somebody dropped out
+    assert all(parameter.isfinite().all() for parameter in load_policy(run.path).parameters())

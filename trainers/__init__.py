@@ -1,1 +1,1 @@
-"""Trainers: behaviour cloning and DAgger, and the pieces they are made of."""
+"""Trainers: behaviour cloning, DAgger and MAPPO, and the pieces they are made of."""

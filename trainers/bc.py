@@ -70,6 +70,7 @@ def bc(
     unseen_config = dataclasses.replace(config, trainer=held_out, seed=derive_seed(config.seed, "validation"))
     validation = flocks_of_all_sizes(unseen_config, policies, expert, **flown)
     training = [] if settings.dataset else flocks_of_all_sizes(config, policies, expert, **flown)
+    flights_at = [part * rounds // parts for part in range(parts)]
     noise = settings.noise
 
     with Journal(run, logger, by_name, [*training, *validation], updates, settings, callbacks) as journal:
@@ -81,10 +82,9 @@ def bc(
                     group.keep(group.fly(expert_share=1.0))
             buffers = [group.buffer for group in training]
         for index in range(rounds):
-            if training and index % -(-rounds // parts) == 0:
-                for group in training:
-                    group.disturbance.scale = noise
-                    group.keep(journal.show(index + 1, group.fly(expert_share=1.0)))
+            for group in training * flights_at.count(index):
+                group.disturbance.scale = noise
+                group.keep(journal.show(index + 1, group.fly(expert_share=1.0)))
             metrics = {"learning_rate": learners[0].learning_rate, "noise": noise}
             losses = []
             for buffer, unseen in zip(buffers, validation, strict=True):

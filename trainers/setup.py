@@ -83,7 +83,7 @@ def settle_model(config: TrainConfig) -> TrainConfig:
     if isinstance(config.trainer, BCConfig) and (config.trainer.models, config.trainer.hops) != (None, None):
         if config.init_from is not None:
             raise InputError(
-                "trainer.models and trainer.hops name fresh policies, init_from one that is there; leave out the one or "
+                "trainer.models and trainer.hops name fresh policies, init_from one that is there; leave out one or "
                 "the other"
             )
         return dataclasses.replace(config, model=next(iter(side_by_side(config).values())).model)

@@ -9,7 +9,17 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
-from modgnn_rl.trainers.imitation import imitation_loss, random_receivers, random_rotations, rotate
+from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
+from modgnn_rl.experts import Reynolds
+from modgnn_rl.trainers.collection import Flocks, as_windows, stores_messages, window_of
+from modgnn_rl.trainers.imitation import (
+    hide_velocities,
+    imitation_loss,
+    random_receivers,
+    random_rotations,
+    rotate,
+    stacked_losses,
+)
 
 FLOCKS, AGENTS = 5, 7
 
@@ -116,3 +126,98 @@ def test_rotate_turns_each_vector_by_the_matrix_of_its_sample():
         for part in (slice(0, 3), slice(3, 6)):
             expected = data[sample, ..., part] @ rotations[sample].T
             torch.testing.assert_close(turned[sample, ..., part], expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [
+        ("pair_force", {}),
+        ("pair_force", {"hops": 2}),
+        ("moment_force", {}),
+        ("modgnn_mlp", {}),
+        ("modgnn_mlp", {"hops": 2}),
+        ("gat", {}),
+    ],
+)
+def test_stored_messages_teach_what_windows_teach(name, model):
+    """Of flights with ends in the middle, from messages as they were flown and as windows make them."""
+    policy = make_model(name, hidden=8, seed=0, **model)
+    settings = DAggerConfig(every=3, capacity=1000, batch_size=16)
+    flocks = Flocks(FlockingConfig(max_steps=6), settings, 4, 4, [policy], Reynolds(), steps=13, stretch=13, seed=0)
+    assert stores_messages(policy)
+    assert flocks.window == 1
+    flights = flocks.fly(0.3)
+    assert bool(flights["is_init"][:, policy.window :].any())
+    made_anew = as_windows(flights.exclude("messages"), policy.window, every=3)
+    stored = as_windows(flights, 1, every=1).view(4, 13)[:, policy.window - 1 :: 3].reshape(-1, 1)
+    receivers = stored["agents", "controlled"][:, -1]
+    losses = [imitation_loss(policy, batch, receivers) for batch in (made_anew, stored)]
+    torch.testing.assert_close(losses[0], losses[1])
+    gradients = [torch.autograd.grad(loss, list(policy.parameters()), allow_unused=True) for loss in losses]
+    for mine, theirs in zip(*gradients, strict=True):
+        if mine is None or theirs is None:
+            assert mine is theirs  # what has no part in the action
+        else:
+            torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "model"), [("pair_force", {"layers": 2}), ("modgnn_mlp", {"layers": 2}), ("mpnn", {"layers": 2})]
+)
+def test_learned_messages_are_not_stored(name, model):
+    assert not stores_messages(make_model(name, hidden=8, seed=0, **model))
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "window"),
+    [("pair_force", {}, 1), ("moment_force", {}, 3), ("modgnn_mlp", {"hops": 2}, 3), ("gcn", {"layers": 2}, 3)],
+)
+def test_stacked_losses_are_those_of_a_loop_with_its_gradients(name, model, window):
+    batch = _batch(window)
+    receivers = random_receivers(batch["agents", "controlled"][:, -1], 3, torch.Generator().manual_seed(1))
+    receivers[0] = False  # a flock without receivers
+    at_once, one_by_one = ([make_model(name, hidden=8, seed=seed, **model) for seed in range(3)] for _ in range(2))
+    for policies in (at_once, one_by_one):  # gradients are added to what is there
+        for parameter in policies[0].parameters():
+            parameter.grad = torch.ones_like(parameter)
+    losses = stacked_losses(at_once, batch, receivers)
+    for policy, other, loss in zip(at_once, one_by_one, losses, strict=True):
+        expected = imitation_loss(other, batch, receivers)
+        expected.backward()
+        torch.testing.assert_close(loss, expected)
+        assert not loss.requires_grad
+        for mine, theirs in zip(policy.parameters(), other.parameters(), strict=True):
+            wanted = torch.zeros_like(mine) if theirs.grad is None else theirs.grad
+            torch.testing.assert_close(mine.grad, wanted, rtol=1e-4, atol=1e-6)
+
+
+@given(share=st.sampled_from([0.0, 0.3, 1.0]), seed=st.integers(0, 1000))
+def test_velocities_are_hidden_of_all_agents_and_steps_of_a_window_or_of_none(share, seed):
+    batch = _batch(3)
+    before = batch.clone()
+    hide_velocities(batch, share, torch.Generator().manual_seed(seed))
+    observation, was = batch["agents", "observation"], before["agents", "observation"]
+    assert torch.equal(observation[..., :3], was[..., :3])
+    hidden = (observation[..., 3:] == 0).flatten(1)
+    kept = (observation[..., 3:] == was[..., 3:]).flatten(1)
+    assert (hidden.all(1) | kept.all(1)).all()
+    if share in (0.0, 1.0):
+        assert hidden.all(1).double().mean() == share
+    for key in ("adjacency", ("agents", "expert_action")):
+        assert torch.equal(batch[key], before[key])
+
+
+def test_velocities_are_hidden_in_the_stated_share_of_windows():
+    batch = torch.cat([_batch(1) for _ in range(200)])
+    hide_velocities(batch, 0.3, torch.Generator().manual_seed(0))
+    hidden = (batch["agents", "observation"][..., 3:] == 0).flatten(1).all(1)
+    assert hidden.double().mean().item() == pytest.approx(0.3, abs=0.05)
+
+
+def test_hidden_velocities_need_windows():
+    """Stored messages hold the velocities."""
+    policy = make_model("pair_force", seed=0)
+    assert window_of([policy], DAggerConfig()) == 1
+    assert window_of([policy], DAggerConfig(hide_velocity=0.1)) == policy.window == 2
+    assert window_of([policy, make_model("pair_force", seed=1)], DAggerConfig()) == 1
+    assert window_of([policy, make_model("modgnn_mlp", hops=3, seed=0)], DAggerConfig()) == 4

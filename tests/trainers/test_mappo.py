@@ -74,7 +74,9 @@ def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_wit
     assert torch.equal(_scores(load_policy(run.path)), _scores(load_policy(cloned.path)))
 
 
-@pytest.mark.parametrize("model", [ModelConfig(hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)])
+@pytest.mark.parametrize(
+    "model", [ModelConfig(name="pair_force", hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)]
+)
 def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, model):
     runs = []
     for number, seed in enumerate((1, 1, 2)):
@@ -100,13 +102,14 @@ def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
     assert all(torch.equal(value, weights[name]) for name, value in checkpoint.tensors["policy"].items())
 
 
-def test_each_size_has_metrics_of_its_own(tmp_path):
-    metrics = train(_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15))).read_metrics()
+def test_each_size_has_metrics_of_its_own(cloned, tmp_path):
+    env, pull = FlockingConfig(num_agents=[3, 5], max_steps=15), {"anchor": 0.2, "anchor_rounds": 4}
+    metrics = train(_config(tmp_path, env=env, init_from=str(cloned.path), **pull)).read_metrics()
     assert [line["step"] for line in metrics] == [1, 2, 3]
     common = ("reward", "cost/leader", "cost/effort", "error", "cohesion", "loss_critic", "kl_approx", "entropy")
     assert all({f"{size}/{name}" for size in (3, 5) for name in common} <= set(line) for line in metrics)
     assert [("3/loss_anchor" in line) for line in metrics] == [False, True, True]
-    assert [line["anchor"] for line in metrics] == pytest.approx([0.1, 0.1, 0.1 * 74 / 75])
+    assert [line["anchor"] for line in metrics] == pytest.approx([0.2, 0.2, 0.15])
     assert metrics[0]["noise"] == pytest.approx(0.3)
 
 
@@ -119,7 +122,9 @@ def test_each_size_has_metrics_of_its_own(tmp_path):
         FlockingConfig(num_agents=2),
     ],
 )
-@pytest.mark.parametrize("model", [ModelConfig(hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)])
+@pytest.mark.parametrize(
+    "model", [ModelConfig(name="pair_force", hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)]
+)
 def test_it_flies_in_every_world(tmp_path, env, model):
     for line in train(_config(tmp_path, env=env, model=model)).read_metrics():
         assert all(value == value for name, value in line.items() if "separation" not in name), line
@@ -174,6 +179,12 @@ def test_the_anchor_fades_linearly_after_the_warm_up():
     assert [anchor_weight(index, 0.2, 0) for index in (-1, 0, 1000)] == [0.2] * 3
 
 
+def test_a_fresh_policy_is_not_held_back(tmp_path):
+    metrics = train(_config(tmp_path, anchor=100.0)).read_metrics()
+    assert [line["anchor"] for line in metrics] == [0.0] * 3
+    assert not any("4/loss_anchor" in line for line in metrics)
+
+
 def test_callbacks_can_stop_it(tmp_path):
     class Stop(Callback):
         def on_round(self, index, metrics):
@@ -182,6 +193,7 @@ def test_callbacks_can_stop_it(tmp_path):
     assert [line["step"] for line in train(_config(tmp_path), callbacks=[Stop()]).read_metrics()] == [1, 2]
 
 
+@pytest.mark.slow
 def test_the_command_trains_on(cloned, tmp_path):
     """As a user runs it: from the run folder of a cloned policy, with the trainer's own YAML."""
     small = ["num_envs=1", "iterations=1", "round_steps=4", "epochs=1", "batches=1", "critic_hidden=8"]
@@ -197,24 +209,12 @@ def test_the_command_trains_on(cloned, tmp_path):
     assert "modgnn_mlp" in json.loads((folder / "evaluation.json").read_text())["3"]["rows"]
 
 
-@pytest.mark.slow
 def test_from_scratch_the_reward_rises(tmp_path):
-    env = FlockingConfig(num_agents=3, max_steps=200)
-    run = train(
-        _config(
-            tmp_path,
-            env=env,
-            model=ModelConfig(hidden=16),
-            num_envs=2,
-            iterations=30,
-            round_steps=32,
-            critic_warmup=2,
-            epochs=4,
-            batches=4,
-            learning_rate=3e-3,
-            anchor=0.0,
-            discount=0.95,
-        )
-    )
+    """Where only effort costs, the best action is the velocity that one has."""
+    others = {f"{name}_cost": 0.0 for name in ("leader", "cohesion", "crowding", "collision", "alignment")}
+    env = FlockingConfig(num_agents=3, max_steps=100, effort_cost=1.0, **others)
+    rates = {"learning_rate": 1e-2, "critic_learning_rate": 1e-2, "discount": 0.9}
+    settings = {"iterations": 8, "round_steps": 16, "epochs": 4, "batches": 4}
+    run = train(_config(tmp_path, env=env, model=ModelConfig(name="gcn"), **rates, **settings))
     rewards = [line["3/reward"] for line in run.read_metrics()]
-    assert sum(rewards[-5:]) / 5 > sum(rewards[:5]) / 5 + 0.05
+    assert sum(rewards[-3:]) > 0.8 * sum(rewards[:3])

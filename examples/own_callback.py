@@ -1,0 +1,81 @@
+"""Train from Python, with an expert and callbacks of one's own.
+
+    python examples/own_callback.py
+
+The expert below keeps more distance than the usual one. `modgnn_rl.training.train` does all that
+``python -m modgnn_rl.train`` does, and leaves the same folder; its callbacks are called while it works: one prints,
+one stops the training as soon as the policy is good enough.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from modgnn_rl.configs.schema import DAggerConfig, EvaluationConfig, FlockingConfig, TrainConfig
+from modgnn_rl.experts import reynolds
+from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.training import train
+
+
+def spacious(observation: Tensor) -> Tensor:
+    """Target velocities, m/s [*B, N, 3], by Reynolds' rule with five times the usual separation."""
+    position, velocity = observation.split(3, -1)
+    return reynolds(position, velocity, cohesion=0.06, separation=4.0, alignment=0.02, max_speed=0.92)
+
+
+class Print(Callback):
+    """Prints how far the flocks keep apart while they learn."""
+
+    def on_round(self, index: int, metrics: Mapping[str, float]) -> None:
+        """Print two of the metrics, which are those of ``metrics.jsonl``."""
+        if "16/error" in metrics:
+            print(f"round {index}: error {metrics['16/error']:.4f} m²/s², nearest {metrics['16/separation']:.2f} m")
+
+
+class StopWhenGood(Callback):
+    """Stops when the policy, flying alone, is nearly as good as asked for."""
+
+    def __init__(self, error: float, name: str = "16/error") -> None:
+        self.error, self.name = error, name
+
+    def on_round(self, index: int, metrics: Mapping[str, float]) -> bool:
+        """Whether to stop."""
+        return metrics.get("expert_share") == 0 and metrics[self.name] < self.error
+
+
+def main(error: float = 0.06, runs: Path = Path("runs"), **trainer: Any) -> dict[str, Any]:
+    """Train.
+
+    Args:
+        error: m²/s², at which to stop.
+        runs: folder for the run folder.
+        trainer: settings of `DAggerConfig`.
+
+    Returns:
+        the figures of ``evaluation.json``.
+    """
+    config = TrainConfig(
+        env=FlockingConfig(num_agents=16),
+        trainer=DAggerConfig(num_envs=16, rounds=60, **trainer),
+        evaluation=EvaluationConfig(num_flocks=20, steps=480),
+        runs=str(runs),
+        name="spacious",
+    )
+    expert = TensorDictModule(spacious, [("agents", "observation")], [("agents", "expert_action")])
+    run = train(config, expert=expert, callbacks=[Print(), StopWhenGood(error)])
+    figures: dict[str, Any] = json.loads((run.path / "evaluation.json").read_text())
+    return figures
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--error", type=float, default=0.06, help="where to stop, m²/s²")
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder for the run folder")
+    main(**vars(parser.parse_args()))

@@ -1,0 +1,113 @@
+"""Write MAPPO as a loop of one's own, with a reward of one's own.
+
+    python examples/own_mappo.py
+
+The reward below asks for something that no expert shows: keep 1 m from the nearest agent. It is written by a transform
+of the environment, in place of the environment's own, from the terms of that and a new one. Actor, critic and loss are
+those of ``python -m modgnn_rl.train trainer=mappo``, and any of them may be another.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
+from torchrl.envs import Transform, TransformedEnv
+
+from modgnn_rl import make_model
+from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.envs.rewards import flocking_costs, flocking_reward
+from modgnn_rl.tensors import pair_distances
+from modgnn_rl.trainers.actor import GaussianActor
+from modgnn_rl.trainers.critic import FlockCritic
+from modgnn_rl.trainers.ppo import AnchoredMAPPOLoss
+
+WEIGHTS = {"spacing": 1.0, "cohesion": 0.02, "collision": 1.0, "alignment": 0.2, "effort": 0.02}  # of the costs
+
+
+class OwnReward(Transform):
+    """Replaces the environment's reward."""
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        position, velocity = next_tensordict["agents", "observation"].split(3, -1)
+        nearest = pair_distances(position).amin(-1)
+        costs = flocking_costs(
+            position,
+            velocity,
+            tensordict["agents", "action"],
+            nearest,
+            crowding_distance=0.4,
+            collision_distance=0.08,
+        )
+        costs["spacing"] = (nearest - 1.0).abs()  # m
+        return next_tensordict.set(("agents", "reward"), flocking_reward(costs, WEIGHTS))
+
+
+def main(
+    num_envs: int = 32,
+    num_agents: int = 8,
+    steps: int = 50,
+    rounds: int = 40,
+    epochs: int = 4,
+    batches: int = 4,
+    seed: int = 0,
+) -> list[float]:
+    """Train a policy; returns the mean reward of a step in each round, before it learns from them."""
+    torch.manual_seed(seed)
+    actor, critic = GaussianActor(make_model("pair_force"), noise=0.3), FlockCritic()
+    env = TransformedEnv(FlockingEnv(num_envs, num_agents, seed=seed, max_steps=500, stagger=True), OwnReward())
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=num_envs * steps,
+        total_frames=num_envs * steps * rounds,
+        auto_register_policy_transforms=True,  # makes the messages recurrent state of the environment
+    )
+    loss_module = AnchoredMAPPOLoss(actor, critic, functional=False, normalize_advantage=True)
+    loss_module.set_keys(
+        action=("agents", "action"),
+        reward=("agents", "reward"),
+        value=("agents", "state_value"),
+        sample_log_prob=("agents", "action_log_prob"),
+    )
+    loss_module.make_value_estimator(gamma=0.97, lmbda=0.95)
+    # One item is one flock's window of steps: TorchRL's losses run recurrent policies over windows.
+    buffer = ReplayBuffer(
+        storage=LazyTensorStorage(num_envs), sampler=SamplerWithoutReplacement(), batch_size=num_envs // batches
+    )
+    optimiser = torch.optim.Adam(
+        [{"params": actor.parameters(), "lr": 1e-3}, {"params": critic.parameters(), "lr": 1e-3}]
+    )
+
+    rewards: list[float] = []
+    for flights in collector:
+        flown = flights["agents", "controlled"]
+        flights["collector", "mask"] = flown.unsqueeze(-1)  # the leader flies as it likes
+        rewards.append(flights["next", "agents", "reward"][flown].mean().item())
+        print(f"round {len(rewards)}: reward {rewards[-1]:.3f}, noise {actor.noise:.2f} m/s")
+        with torch.no_grad():
+            loss_module.value_estimator(flights)
+        buffer.extend(flights)
+        for _ in range(epochs):
+            for batch in buffer:
+                losses = loss_module(batch)
+                optimiser.zero_grad()
+                (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
+                torch.nn.utils.clip_grad_norm_(loss_module.parameters(), 1.0)
+                optimiser.step()
+    return rewards
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--num-envs", type=int, default=32, help="flocks flown at once")
+    parser.add_argument("--num-agents", type=int, default=8, help="agents in each, the leader included")
+    parser.add_argument("--steps", type=int, default=50, help="steps flown in each round")
+    parser.add_argument("--rounds", type=int, default=40)
+    parser.add_argument("--epochs", type=int, default=4, help="passes over the flights of one round")
+    parser.add_argument("--batches", type=int, default=4, help="parts of such a pass")
+    parser.add_argument("--seed", type=int, default=0)
+    main(**vars(parser.parse_args()))

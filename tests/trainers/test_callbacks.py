@@ -1,0 +1,184 @@
+"""Where people's own code is called, what it can do there, and an expert of one's own."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from modgnn_rl import load_policy, training
+from modgnn_rl.checkpoint import load_checkpoint
+from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
+from modgnn_rl.trainers.callbacks import Callback, StopOnPlateau
+from modgnn_rl.training import train
+
+SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 400}
+TRAINERS = {
+    "bc": BCConfig(**SMALL, cloning_steps=8, cloning_updates=4, held_out=2),
+    "dagger": DAggerConfig(**SMALL, cloning_steps=8, cloning_updates=2, rounds=3, round_steps=4, round_updates=2),
+    "mappo": MAPPOConfig(
+        num_envs=1, iterations=3, round_steps=4, critic_warmup=0, epochs=1, batches=1, critic_hidden=8
+    ),
+}
+# Number of the rounds in which flights come in, and of all rounds.
+ROUNDS = {"bc": ([1], [1, 2, 3, 4]), "dagger": ([0, 0, 1, 2, 3], [0, 1, 2, 3]), "mappo": ([1, 2, 3], [1, 2, 3])}
+
+
+@pytest.fixture(autouse=True)
+def _without_evaluation(monkeypatch):
+    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+
+
+def _config(runs, trainer, **others):
+    return TrainConfig(
+        env=FlockingConfig(num_agents=4),
+        model=ModelConfig(name="pair_force", hidden=8),
+        trainer=trainer,
+        runs=str(runs),
+        threads=1,
+        **others,
+    )
+
+
+class _Watch(Callback):
+    def __init__(self, stop_at=None):
+        self.calls, self.stop_at, self.metrics = [], stop_at, []
+
+    def on_start(self, policies):
+        self.calls.append(("start", tuple(policies)))
+        self.policies = policies
+
+    def on_flights(self, index, flights):
+        self.calls.append(("flights", index))
+        assert flights["agents", "observation"].shape[0] == 8  # flocks of 4: as many agents as 1 of 32
+        assert ("agents", "expert_action") in flights.keys(include_nested=True)
+
+    def on_round(self, index, metrics):
+        self.calls.append(("round", index))
+        self.metrics.append(dict(metrics))
+        return index == self.stop_at
+
+    def on_end(self, policies):
+        self.calls.append(("end", tuple(policies)))
+        self.ended = policies
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_the_four_places(tmp_path, name):
+    watch = _Watch()
+    run = train(_config(tmp_path, TRAINERS[name]), callbacks=[watch])
+    kinds = {kind: [value for called, value in watch.calls if called == kind] for kind, _ in watch.calls}
+    assert watch.calls[0] == ("start", ("pair_force",))
+    assert watch.calls[-1] == ("end", ("pair_force",))
+    assert (kinds["flights"], kinds["round"]) == ROUNDS[name]
+    # Flights are shown before the round that learns from them is over.
+    assert watch.calls.index(("flights", kinds["flights"][-1])) < watch.calls.index(("round", kinds["flights"][-1]))
+    written = [{key: value for key, value in line.items() if key != "step"} for line in run.read_metrics()]
+    for shown, line in zip(watch.metrics, written, strict=True):
+        assert {key: value for key, value in shown.items() if math.isfinite(value)} == {
+            key: value for key, value in line.items() if math.isfinite(value)
+        }
+    weights = load_policy(run.path).state_dict()
+    assert watch.ended["pair_force"] is watch.policies["pair_force"]
+    assert all(torch.equal(value, weights[key]) for key, value in watch.ended["pair_force"].state_dict().items())
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_any_of_several_callbacks_stops_the_training_and_all_are_called(tmp_path, name):
+    watches = [_Watch(), _Watch(stop_at=2), _Watch()]
+    run = train(_config(tmp_path, TRAINERS[name]), callbacks=watches)
+    assert run.read_metrics()[-1]["step"] == 2
+    assert [watch.calls for watch in watches[1:]] == [watches[0].calls] * 2
+    assert ("end", ("pair_force",)) in watches[0].calls
+    assert load_checkpoint(run.checkpoints).state["learners"] == ["pair_force"]
+
+
+@pytest.mark.parametrize("name", ["bc", "dagger"])
+def test_what_a_callback_changes_in_the_flights_is_learned_from(tmp_path, name):
+    class Zero(Callback):
+        def on_flights(self, index, flights):
+            flights["agents", "expert_action"].zero_()
+
+    losses = []
+    for callbacks in ([], [Zero()]):
+        run = train(_config(tmp_path, TRAINERS[name]), callbacks=callbacks)
+        losses.append(next(line["4/loss"] for line in run.read_metrics() if "4/loss" in line))
+    assert losses[0] != losses[1]
+
+
+def test_a_callback_that_fails_ends_the_run_with_its_own_error(tmp_path):
+    class Fail(_Watch):
+        def on_round(self, index, metrics):
+            raise RuntimeError("mine")
+
+    watch = Fail()
+    with pytest.raises(RuntimeError, match="mine"):
+        train(_config(tmp_path, TRAINERS["dagger"]), callbacks=[watch])
+    assert "end" not in {kind for kind, _ in watch.calls}
+
+
+def _steps_until_stop(values, **settings):
+    plateau = StopOnPlateau(**{"rounds": 2, "gain": 0.1, "names": ["4/error"], **settings})
+    for index, value in enumerate(values, start=1):
+        metrics = value if isinstance(value, dict) else {"4/error": value}
+        if plateau.on_round(index, metrics):
+            return index
+    return None
+
+
+def test_a_plateau_is_where_the_mean_falls_less_than_the_gain():
+    falling = [0.8**k for k in range(20)]
+    assert _steps_until_stop(falling) is None
+    assert _steps_until_stop([1.0] * 20) == 4  # two rounds, and two before them
+    assert _steps_until_stop([1.0, 1.0, 0.89, 0.89, 0.89, 0.89]) == 5  # 0.89 / 0.945 is no tenth less
+    assert _steps_until_stop([1.0, 1.0, 0.91, 0.91]) == 4
+    assert _steps_until_stop([1.0] * 20, gain=0.0) is None  # not above what was
+    assert _steps_until_stop([1.0, 1.0, 1.0, 1.1], gain=0.0) == 4
+    assert _steps_until_stop([1.0] * 20, rounds=5) == 10
+
+
+def test_rounds_without_the_metric_and_the_first_ones_do_not_count():
+    assert _steps_until_stop([math.nan, 1.0, {}, 1.0, math.nan, 1.0, 1.0]) == 7
+    assert _steps_until_stop([1.0] * 20, after=6) == 10
+
+
+def test_a_plateau_of_several_sizes_is_that_of_their_mean():
+    names = ["4/error", "8/error"]
+    metrics = [{"4/error": 0.7**k, "8/error": 1.0} for k in range(20)]
+    alone = _steps_until_stop(metrics)
+    together = _steps_until_stop(metrics, names=names)
+    assert alone is None
+    assert together is not None
+    assert _steps_until_stop([{"4/error": 1.0}] * 20, names=names) is None
+
+
+@pytest.mark.parametrize("name", ["bc", "dagger"])
+def test_an_expert_of_ones_own_is_learned_from(tmp_path, monkeypatch, name):
+    """It stands still; the trained policy does too, and its errors are against it."""
+    still = TensorDictModule(
+        lambda observation: 0.0 * observation[..., :3],
+        in_keys=[("agents", "observation")],
+        out_keys=[("agents", "expert_action")],
+    )
+    shared = {"num_envs": 1, "batch_size": 64, "averaging": 0.5, "learning_rates": [1e-2, 1e-2, 1e-2]}
+    trainer = {
+        "bc": BCConfig(**shared, cloning_steps=20, cloning_updates=40, held_out=2),
+        "dagger": DAggerConfig(
+            **shared,
+            cloning_steps=10,
+            cloning_updates=20,
+            rounds=3,
+            round_steps=5,
+            round_updates=20,
+            expert_share=0.0,
+            stretch=5,
+        ),
+    }[name]
+    seen = []
+    monkeypatch.setattr(training, "evaluate_policies", lambda *_, expert=None, **__: seen.append(expert) or {})
+    run = train(_config(tmp_path, trainer), expert=still)
+    assert seen == [still]
+    errors = [line["4/error"] for line in run.read_metrics() if "4/error" in line]
+    assert errors[-1] < 0.01  # far from Reynolds, whose mean square action is above 0.2

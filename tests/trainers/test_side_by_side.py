@@ -1,0 +1,222 @@
+"""Several policies cloned side by side: the same batches for all, and a run folder of each."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from modgnn_rl import load_policy, make_model, training
+from modgnn_rl.checkpoint import load_checkpoint
+from modgnn_rl.configs.schema import BCConfig, FlockingConfig, ModelConfig, TrainConfig
+from modgnn_rl.errors import InputError
+from modgnn_rl.experts import Reynolds
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.trainers import bc as trainer_module
+from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.collection import Flocks
+from modgnn_rl.trainers.learner import Learner, fit_together, validate_together
+from modgnn_rl.trainers.mixing import Disturbance
+from modgnn_rl.trainers.setup import side_by_side
+from modgnn_rl.training import train
+
+WORLD = FlockingConfig(num_agents=4, max_steps=30)
+
+
+@pytest.fixture
+def _without_evaluation(monkeypatch):
+    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+
+
+def _config(runs, *, model=None, seed=0, **settings):
+    small = {
+        "num_envs": 1,
+        "batch_size": 8,
+        "cloning_steps": 12,
+        "cloning_updates": 20,
+        "held_out": 2,
+        "averaging": 0.8,
+    }
+    return TrainConfig(
+        env=WORLD,
+        model=model or ModelConfig(name="pair_force", hidden=8),
+        trainer=BCConfig(**{**small, **settings}),
+        runs=str(runs),
+        seed=seed,
+        threads=1,
+    )
+
+
+def _equal(policy, other):
+    mine, theirs = policy.state_dict(), other.state_dict()
+    return mine.keys() == theirs.keys() and all(torch.equal(value, theirs[name]) for name, value in mine.items())
+
+
+SEVERAL = {"models": ["modgnn_mlp", "gcn"], "hops": [1, 2], "seeds": 2}
+NAMES = [f"{model}-K{hops}-seed{seed}" for model in ("modgnn_mlp", "gcn") for hops in (1, 2) for seed in (0, 1)]
+
+
+def test_a_run_of_several_policies(tmp_path, monkeypatch):
+    """Folders, names, metrics."""
+    evaluated = []
+    monkeypatch.setattr(training, "evaluate_policies", lambda _, policies, *__, **___: evaluated.append(policies) or {})
+    run = train(_config(tmp_path, **SEVERAL, cloning_steps=8, held_out=1))
+    assert sorted(path.name for path in run.path.iterdir() if (path / "config.yaml").exists()) == sorted(NAMES)
+    assert [list(policies) for policies in evaluated] == [NAMES]
+    for line in run.read_metrics():
+        expected = {f"{name}/4/{metric}" for name in NAMES for metric in ("loss", "validation_loss")}
+        assert expected <= set(line)
+    assert all(f"{name}/4/error" in run.read_metrics()[-1] for name in NAMES)
+    assert load_checkpoint(run.checkpoints).state["learners"] == NAMES
+
+    weights = []
+    for name in NAMES:
+        config = RunFolder.open(run.path / name).config
+        model, hops, seed = name.split("-")
+        assert (config["model"]["name"], f"K{config['model']['hops']}") == (model, hops)
+        assert (config["trainer"]["models"], config["trainer"]["hops"], config["trainer"]["seeds"]) == (None, None, 1)
+        assert (config["seed"] == 0) == (seed == "seed0")
+        policy = load_policy(run.path / name)
+        assert policy.hops == int(hops[1:])
+        assert _equal(policy, evaluated[0][name])
+        weights.append(torch.cat([value.flatten() for value in policy.state_dict().values()]))
+    for pair in range(0, len(NAMES), 2):
+        assert not torch.equal(weights[pair], weights[pair + 1])  # seeds
+    assert _equal(load_policy(run.path), load_policy(run.path / NAMES[0]))
+
+
+@pytest.mark.usefixtures("_without_evaluation")
+def test_one_seed_fixes_a_run_of_several_policies(tmp_path):
+    metrics = [train(_config(tmp_path, **SEVERAL, cloning_updates=2)).metrics_file.read_bytes() for _ in range(2)]
+    assert metrics[0] == metrics[1]
+
+
+@pytest.mark.usefixtures("_without_evaluation")
+def test_a_policy_trained_beside_others_is_the_one_trained_alone(tmp_path):
+    """The first of several seeds draws; its data, weights and batches are those of a run of its own."""
+    model = ModelConfig(name="mpnn", layers=2, hidden=8)
+    alone = train(_config(tmp_path, model=model))
+    several = train(_config(tmp_path, model=model, seeds=2))
+    mine, theirs = load_policy(several.path / "mpnn-K1-seed0"), load_policy(alone.path)
+    for name, value in mine.state_dict().items():
+        torch.testing.assert_close(value, theirs.state_dict()[name], rtol=1e-4, atol=1e-5)
+    losses = [run.read_metrics()[-1] for run in (alone, several)]
+    assert losses[1]["mpnn-K1-seed0/4/validation_loss"] == pytest.approx(losses[0]["4/validation_loss"], rel=1e-3)
+
+
+def test_names_and_seeds_of_the_members():
+    members = side_by_side(_config("runs", **SEVERAL))
+    assert list(members) == NAMES
+    assert members["gcn-K2-seed0"].model == ModelConfig(name="gcn", hops=2, hidden=8)
+    assert members["gcn-K2-seed1"].seed == members["modgnn_mlp-K1-seed1"].seed != 0
+    assert list(side_by_side(_config("runs"))) == ["pair_force"]
+    assert list(side_by_side(_config("runs", models=["gcn"], hops=[3]))) == ["gcn"]
+    assert list(side_by_side(_config("runs", models="gcn", hops=[1, 3]))) == ["gcn-K1", "gcn-K3"]
+    assert list(side_by_side(_config("runs", seeds=2))) == ["pair_force-K1-seed0", "pair_force-K1-seed1"]
+
+
+@pytest.mark.usefixtures("_without_evaluation")
+def test_members_are_trained_by_what_they_are_told_to(tmp_path):
+    class Start(Callback):
+        def on_start(self, policies):
+            self.policies = {
+                name: {key: value.clone() for key, value in policy.state_dict().items()}
+                for name, policy in policies.items()
+            }
+
+    start = Start()
+    train(_config(tmp_path, models=["gcn"], hops=[1, 2], cloning_updates=1), callbacks=[start])
+    for hops in (1, 2):
+        fresh = side_by_side(_config(tmp_path, models=["gcn"], hops=[1, 2]))[f"gcn-K{hops}"]
+        expected = trainer_module.make_learner(fresh, (1, 1)).flown.state_dict()
+        assert all(torch.equal(value, expected[key]) for key, value in start.policies[f"gcn-K{hops}"].items())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"models": ["gcn", "gnc"]}, r"trainer\.models=gnc is not one of .*did you mean 'gcn'"),
+        ({"hops": [1, -1]}, r"trainer\.hops=-1 is out of range"),
+        (
+            {"models": ["gcn", "pair_force"], "hops": [0, 1]},
+            "model.name=pair_force with model.hops=0 has nothing to learn",
+        ),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_before_anything_is_created(tmp_path, settings, message):
+    with pytest.raises(InputError, match=message):
+        train(_config(tmp_path / "runs", **settings))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("_without_evaluation")
+def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path, monkeypatch):
+    flown, forward = [], Disturbance.forward
+
+    def watched(self, tensordict):
+        if not flown or flown[-1] != self.scale:
+            flown.append(self.scale)
+        return forward(self, tensordict)
+
+    monkeypatch.setattr(Disturbance, "forward", watched)
+    metrics = train(_config(tmp_path, dart=True, noise=0.1, cloning_updates=40)).read_metrics()
+    # Tried out and flown for validation without noise; each part with the error of the round before it.
+    after = [metrics[index]["4/validation_loss"] ** 0.5 for index in (9, 19, 29)]
+    assert flown == pytest.approx([0.0, 0.1, *after])
+    assert [line["noise"] for line in metrics[1:]] == pytest.approx(
+        [line["4/validation_loss"] ** 0.5 for line in metrics[:-1]]
+    )
+
+
+@pytest.mark.usefixtures("_without_evaluation")
+@pytest.mark.parametrize("rounds", [2, 6])
+@pytest.mark.parametrize(("settings", "sets"), [({}, 1), ({"dart": True}, 4)])
+def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settings, sets, rounds):
+    seen, keep = [], Flocks.keep
+
+    def watched(self, flights):
+        keep(self, flights)
+        seen.append((self.env.batch_size[0], flights.shape[1], self.seen))
+
+    monkeypatch.setattr(Flocks, "keep", watched)
+    train(_config(tmp_path, cloning_updates=rounds, every=1, noise=0.2, **settings))
+    of_training = [entry for entry in seen if entry[0] == 8]
+    assert len(of_training) == sets
+    assert sum(steps for _, steps, _ in of_training) == 12
+    assert of_training[-1][2] == 8 * 12
+
+
+def _flights(policies, **settings):
+    trainer = BCConfig(**{"num_envs": 1, "batch_size": 8, "averaging": 0.8, **settings})
+    flocks = Flocks(WORLD, trainer, 6, 4, policies, Reynolds(), steps=12, stretch=12, seed=0)
+    flocks.keep(flocks.fly(1.0))
+    return trainer, flocks.buffer
+
+
+@pytest.mark.parametrize(
+    "models",
+    [
+        [("modgnn_mlp", {"hops": 2}), ("gcn", {"hops": 1})],  # one after the other, over windows
+        [("mpnn", {"layers": 2}), ("mpnn", {"layers": 2})],  # at once, over windows
+        [("pair_force", {}), ("pair_force", {}), ("pair_force", {})],  # at once, from stored messages
+    ],
+)
+def test_fitting_together_is_fitting_each_alone_on_the_same_batches(models):
+    def policies():
+        return [make_model(name, hidden=8, seed=seed, **model) for seed, (name, model) in enumerate(models)]
+
+    trainer, buffer = _flights(policies(), hide_velocity=0.0)
+    together = [Learner(policy, trainer, (12, 12), seed=0) for policy in policies()]
+    losses = fit_together(together, buffer, 12)
+    final = validate_together(together, buffer)
+    for number, policy in enumerate(policies()):
+        _, buffer = _flights(policies())  # the same data, and the same draws of batches
+        alone = Learner(policy, trainer, (12, 12), seed=0)
+        assert fit_together([alone], buffer, 12)[0] == pytest.approx(losses[number], rel=1e-4)
+        assert alone.validate(buffer) == pytest.approx(final[number], rel=1e-3)
+        for kind in ("policy", "flown"):
+            for name, value in getattr(alone, kind).state_dict().items():
+                torch.testing.assert_close(
+                    getattr(together[number], kind).state_dict()[name], value, rtol=1e-3, atol=1e-5
+                )
+        assert together[number].updates_done == alone.updates_done == 12
+        assert together[number].learning_rate == alone.learning_rate
