@@ -310,14 +310,14 @@ class MAPPOConfig(TrainerConfig):
         "agents of a state of 32 that count in an update; at other sizes N, as many links: 32 / N times as many agents",
         low=1,
     )
-    iterations: int = setting(100, "rounds of flying and improving", low=0)
+    iterations: int = setting(100, "rounds of flying and improving", low=1)
     round_steps: int = setting(50, "steps flown in a round", low=2)
     critic_warmup: int = setting(10, "rounds at first in which only the critic learns", low=0)
     epochs: int = setting(4, "passes over the flights of a round", low=1)
     batches: int = setting(4, "batches that the flights of a round are split into, for each size", low=1)
     window: int = setting(10, "steps of the windows from which learned messages are made anew", low=1)
     noise: float = setting(0.3, "standard deviation of the explored actions at the start, m/s", above=0)
-    discount: float = setting(0.99, "discount of a step", low=0, high=1)
+    discount: float = setting(0.99, "discount of a step", low=0, high=0.9999)
     trace: float = setting(0.95, "lambda of the advantage estimator (GAE)", low=0, high=1)
     clip: float = setting(0.2, "probability ratios are clipped to 1 +- this", above=0, high=1)
     entropy: float = setting(0.0, "weight of the entropy of the actions in the objective", low=0)

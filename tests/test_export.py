@@ -340,7 +340,7 @@ def test_a_full_disk_leaves_the_older_export(broken: str, tmp_path: Path, monkey
 @pytest.fixture
 def run(tmp_path: Path) -> RunFolder:
     """A run folder as training leaves it, with the policy that it began with."""
-    config = TrainConfig(trainer=DAggerConfig(), model=ModelConfig(hops=2, hidden=8))
+    config = TrainConfig(trainer=DAggerConfig(), model=ModelConfig(name="pair_force", hops=2, hidden=8))
     folder = RunFolder.create(tmp_path, "run", OmegaConf.to_yaml(OmegaConf.structured(config)))
     save_checkpoint(folder.checkpoints, 0, {"policy": make_model("pair_force", 2, 8, seed=3).state_dict()}, {})
     return folder

@@ -78,6 +78,7 @@ def dagger(
                 group.keep(journal.show(0, group.fly(expert_share=1.0)))
             loss, *_ = fit_together(learners, group.buffer, cloning)
             journal.note(0, {f"{group.num_agents}/loss": loss}, cloning, cloned=loss)
+            group.mixture.restart()
 
         for index in range(settings.rounds):
             share = expert_share(

@@ -89,9 +89,9 @@ class Journal:
 
     def __enter__(self) -> Journal:
         """Start the progress bar."""
-        self.progress.__enter__()
         for callback in self.callbacks:
             callback.on_start(self.policies)
+        self.progress.__enter__()
         return self
 
     def __exit__(

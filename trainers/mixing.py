@@ -128,7 +128,7 @@ class SafetyGate(TensorDictModuleBase):
         threshold: the expert flies above it.
         action: key of the action to be flown, overwritten [*B, N, 3].
         expert_action: key of the expert's action [*B, N, 3].
-        expert_flies: key that tells who flew, bool [*B, 1]; brought up to date where it is there.
+        expert_flies: key that tells who flew, bool [*B, 1]; where a `Mixture` stands before the gate, both count.
     """
 
     def __init__(

@@ -97,3 +97,19 @@ def test_all_data_of_a_state_are_replaced_together():
     stored = flocks.buffer[:]
     expected = Reynolds()(stored.select(("agents", "observation")))["agents", "expert_action"]
     torch.testing.assert_close(stored["agents", "expert_action"], expected)
+
+
+def test_a_reservoir_fills_up_before_anything_goes():
+    """The round that finds room for a part of its states keeps that part, and draws for the rest."""
+    flocks, store = _flocks("reservoir", capacity=25), []
+    for _ in range(4):
+        flights = flocks.fly(0.5)
+        draws = flocks.noise.clone_state()
+        flocks.keep(flights)
+        new = list(flights["agents", "observation"].flatten(0, 1))
+        room, seen = 25 - len(store), flocks.seen - len(new)
+        store, new = store + new[:room], new[room:]
+        if new:
+            for place, item in zip(*reservoir_places(seen + room, len(new), 25, draws), strict=True):
+                store[place] = new[item]
+    assert torch.equal(flocks.buffer[:]["agents", "observation"].squeeze(1), torch.stack(store))
