@@ -1,7 +1,7 @@
 """Draw metrics of runs over their rounds: ``python benchmarks/curves.py curves.png 32/error runs/a runs/b ...``.
 
-Runs whose names differ in ``-seed<n>`` or a trailing number only share a line (their mean) and a band (lowest to
-highest). Needs the extra ``plots``.
+Runs with one label, ``runs/a=label``, or whose names differ in ``-seed<n>`` or a trailing number only, share a line
+(their mean) and a band (lowest to highest). Needs the extra ``plots``.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ def main() -> None:
     options = parser.parse_args()
     groups: dict[str, list[list[dict[str, float]]]] = defaultdict(list)
     for path in options.runs:
-        run = RunFolder.open(path)
-        groups[group_of(run)].append(run.read_metrics())
+        folder, _, label = path.partition("=")
+        run = RunFolder.open(folder)
+        groups[label or group_of(run)].append(run.read_metrics())
     names = options.metrics.split(",")
     figure, axes = plt.subplots(1, len(names), figsize=(4.4 * len(names), 3.2), squeeze=False, layout="constrained")
     for axis, name in zip(axes[0], names, strict=True):

@@ -41,7 +41,7 @@ def nearness(tensordict: TensorDictBase) -> Tensor:
 SCHEDULES: dict[str, Callable[[int], float]] = {
     "exponential": lambda index: 0.6**index,
     "linear": lambda index: max(0.0, 1 - index / 10),
-    "cloning": lambda index: 1.0,  # the expert flies throughout
+    "never": lambda index: 0.0,  # but for the first round
 }
 GATES: dict[str, list[SafetyGate]] = {
     "none": [],
@@ -97,7 +97,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--schedule", choices=SCHEDULES, default="exponential", help="how the expert's share falls")
+    parser.add_argument("--schedule", choices=SCHEDULES, default="exponential", help="the expert's share by round")
     parser.add_argument("--gate", choices=GATES, default="disagreement", help="when the expert takes over")
     parser.add_argument("--num-envs", type=int, default=32, help="flocks flown at once")
     parser.add_argument("--num-agents", type=int, default=16, help="agents in each, the leader included")

@@ -54,7 +54,9 @@ def train(
     config = settle_model(config)
     check_training(config)
     if expert is not None and getattr(config.trainer, "dataset", None):
-        raise InputError("trainer.dataset holds the labels of Reynolds flocking, not those of your expert; leave one out")
+        raise InputError(
+            "trainer.dataset holds the labels of Reynolds flocking, not those of your expert; leave one out"
+        )
     name = config.name or f"{config.trainer.name}-{config.model.name}"
     run = RunFolder.create(config.runs, name, OmegaConf.to_yaml(OmegaConf.structured(config)))
     print(f"Training in {run.path}", flush=True)

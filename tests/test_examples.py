@@ -10,7 +10,10 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
+
+from modgnn_rl.envs import FlockingEnv
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -76,3 +79,52 @@ def test_the_loss_of_the_vmas_example_sees_the_messages_that_were_flown():
     flights["messages"].zero_()
     with torch.no_grad():
         assert loss_module(flights)["kl_approx"].abs().max() > 1e-4  # the messages before the window count
+
+
+def test_a_policy_imitates_an_expert_of_ones_own_on_vmas():
+    pytest.importorskip("vmas")
+    results = example("imitate_on_vmas").main(num_envs=16, num_agents=3, steps=30, rounds=3, updates=40)
+    (before, _), (after, _) = results["policy before"], results["policy"]
+    assert results["expert"][0] == 0
+    assert after < 0.4 * before
+
+
+@pytest.mark.parametrize(("schedule", "gate"), [("exponential", "disagreement"), ("linear", "near"), ("never", "none")])
+def test_own_dagger_learns_with_each_gate_and_schedule(schedule, gate):
+    small = {"num_envs": 4, "num_agents": 8, "steps": 20, "rounds": 2, "updates": 25, "test_steps": 20}
+    errors = example("own_dagger").main(schedule, gate, **small)
+    assert len(errors) == 2
+    assert errors[-1] < 0.8 * errors[0]
+
+
+def test_own_mappo_earns_more_of_its_own_reward():
+    rewards = example("own_mappo").main(num_envs=16, num_agents=6, steps=30, rounds=5, batches=2)
+    assert rewards[-1] > rewards[0]
+
+
+def test_own_reward_counts_what_it_says():
+    module = example("own_mappo")
+    env = TransformedEnv(FlockingEnv(2, 5, seed=0), module.OwnReward())
+    check_env_specs(env)
+    step = env.rollout(2)[:, -1]
+    position, velocity = step["next", "agents", "observation"].split(3, -1)
+    nearest = (torch.cdist(position, position) + 1e9 * torch.eye(5)).amin(-1)
+    spread, drift = (vectors - vectors.mean(1, keepdim=True) for vectors in (position, velocity))
+    costs = {
+        "spacing": (nearest - 1).abs(),
+        "cohesion": spread.norm(dim=-1),
+        "collision": (nearest < 0.08).float(),
+        "alignment": drift.norm(dim=-1),
+        "effort": (step["agents", "action"] - velocity).norm(dim=-1),
+    }
+    expected = -sum(module.WEIGHTS[name] * cost for name, cost in costs.items())
+    torch.testing.assert_close(step["next", "agents", "reward"].squeeze(-1), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_own_callback_stops_early_and_learns_from_an_expert_that_keeps_more_distance(tmp_path, capsys):
+    small = {"batch_size": 16, "cloning_steps": 20, "cloning_updates": 5, "round_steps": 20, "round_updates": 2}
+    figures = example("own_callback").main(error=1.0, runs=tmp_path, steps=20, expert_rounds=1, **small)
+    assert figures["8"]["rows"]["expert"]["error"]["mean"] == 0
+    printed = capsys.readouterr().out
+    assert "round 2: error" in printed
+    assert "round 3: error" not in printed  # the first round that the policy flies alone is the second

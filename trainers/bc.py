@@ -102,11 +102,10 @@ def bc(
             if journal.note(index + 1, metrics, fitting * len(sizes), validation_loss=loss):
                 break
 
-    if len(members) > 1:
-        for name, member in members.items():
-            own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
-            learner = by_name[name]
-            save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.flown.state_dict()}, {})
+    for name, member in members.items() if len(members) > 1 else ():
+        own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
+        learner = by_name[name]
+        save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.flown.state_dict()}, {})
     return dict(zip(by_name, policies, strict=True))
 
 
