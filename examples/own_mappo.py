@@ -19,6 +19,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacem
 from torchrl.envs import Transform, TransformedEnv
 
 from modgnn_rl import make_model
+from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.rewards import flocking_costs, flocking_reward
 from modgnn_rl.tensors import pair_distances
@@ -27,7 +28,6 @@ from modgnn_rl.trainers.critic import FlockCritic
 from modgnn_rl.trainers.ppo import AnchoredMAPPOLoss
 
 WEIGHTS = {"spacing": 1.0, "cohesion": 0.02, "collision": 1.0, "alignment": 0.2, "effort": 0.02}  # of the costs
-SLOWER = {"control_frequency": 12.0, "physics_substeps": 20}  # an action lasts 1/12 s, so that it is felt soon
 
 
 class OwnReward(Transform):
@@ -60,7 +60,9 @@ def main(
     """Train a policy; returns the mean reward of a step in each round, before it learns from them."""
     torch.manual_seed(seed)
     actor, critic = GaussianActor(make_model("pair_force"), noise=0.3), FlockCritic()
-    env = TransformedEnv(FlockingEnv(num_envs, num_agents, seed=seed, max_steps=steps, **SLOWER), OwnReward())
+    # An action lasts 1/12 s here, so that what it does is felt within few steps.
+    world = FlockingConfig(max_steps=steps, control_frequency=12.0, physics_substeps=20)
+    env = TransformedEnv(FlockingEnv(num_envs, num_agents, config=world, seed=seed), OwnReward())
     collector = Collector(
         env,
         actor,

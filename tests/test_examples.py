@@ -97,9 +97,11 @@ def test_own_dagger_learns_with_each_gate_and_schedule(schedule, gate):
     assert errors[-1] < 0.8 * errors[0]
 
 
-def test_own_mappo_earns_more_of_its_own_reward():
-    rewards = example("own_mappo").main(num_envs=16, num_agents=6, steps=30, rounds=5, batches=2)
-    assert rewards[-1] > rewards[0]
+def test_own_mappo_earns_more_of_its_own_reward(monkeypatch):
+    module = example("own_mappo")
+    monkeypatch.setattr(module, "WEIGHTS", {"effort": 1.0})  # what is felt at once is learned at once
+    rewards = module.main(num_envs=16, num_agents=4, steps=20, rounds=5)
+    assert rewards[-1] > rewards[0] + 0.01
 
 
 def test_own_reward_counts_what_it_says():
