@@ -329,7 +329,8 @@ def test_plain_data_hold_no_trace_of_parameters() -> None:
     assert ModGNN(ModGNNLayer(1, f_com=_Pairwise())).sends_plain_data  # what it makes of messages is not sent on
     assert not ModGNN(ModGNNLayer(2, f_com=_Pairwise())).sends_plain_data
     assert not ModGNN(ModGNNLayer(2, aggregation="max")).sends_plain_data
-    assert not ModGNN([ModGNNLayer(1), ModGNNLayer(1)]).sends_plain_data
+    assert ModGNN([ModGNNLayer(1), ModGNNLayer(1, f_pre=dense())]).sends_plain_data
+    assert not ModGNN([ModGNNLayer(1, f_pre=dense()), ModGNNLayer(1)]).sends_plain_data
 
 
 def keyed_policy(**keys: object) -> ModGNN:

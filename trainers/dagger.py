@@ -95,6 +95,7 @@ def dagger(
                 metrics |= flight_metrics(flights, config.env)
                 metrics[f"{group.num_agents}/loss"], *_ = fit_together(learners, group.buffer, fitting)
             error = sum(metrics[f"{size}/error"] for size in sizes) / len(sizes)
+            metrics["error"] = error
             round_ = f"{index + 1}/{settings.rounds}"
             if journal.note(index + 1, metrics, fitting * len(sizes), round=round_, error=error):
                 break
