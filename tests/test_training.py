@@ -145,9 +145,9 @@ def test_one_seed_fixes_a_run(tmp_path):
     assert metrics[0] != metrics[2]
 
 
-@pytest.mark.parametrize("model", ["modgnn_mlp", "gcn", "pair_force"])
+@pytest.mark.parametrize("model", ["modgnn_mlp", "pair_force"])
 def test_behaviour_cloning_of_several_sizes(tmp_path, model):
-    trainer = BCConfig(**SMALL, cloning_steps=30, cloning_updates=82, held_out=2)
+    trainer = BCConfig(**SMALL, cloning_steps=10, cloning_updates=40, held_out=2)
     env = FlockingConfig(num_agents=[3, 6])
     run = train(_config(tmp_path, trainer, env=env, model=ModelConfig(name=model, hops=2, hidden=8)))
     assert {"3/validation_loss", "6/validation_loss"} <= set(run.read_metrics()[-1])
@@ -215,7 +215,7 @@ def test_a_folder_that_is_no_run(tmp_path):
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("model", ["pair_force", "moment_force", "mpnn"])
+@pytest.mark.parametrize("model", ["moment_force", "mpnn"])
 def test_training_goes_on_under_faults_and_learns_from_the_true_state(tmp_path, model):
     world = FlockingConfig(
         num_agents=[4, 6],
