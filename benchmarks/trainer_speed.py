@@ -1,0 +1,104 @@
+"""What an update of imitation costs, by model, and several seeds at once against one after the other.
+
+    python benchmarks/trainer_speed.py
+
+One thread, processor time, medians of runs that take turns, flocks of 32 agents flown by the expert.
+"""
+
+from __future__ import annotations
+
+import functools
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
+
+from modgnn_rl import ModGNN, make_model
+from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
+from modgnn_rl.experts import Reynolds
+from modgnn_rl.trainers.collection import Flocks
+from modgnn_rl.trainers.imitation import imitation_loss, stacked_losses
+from modgnn_rl.trainers.learner import Learner
+from modgnn_rl.training import prepare_torch
+
+REPETITIONS = 9
+# Model, layers, states in a batch, receivers in each of 32 agents.
+UPDATES = (
+    ("pair_force", 1, 256, 4),
+    ("moment_force", 2, 256, 4),
+    ("pair_force", 2, 64, 16),
+    ("pair_force", 2, 256, 4),
+)
+SEEDS = 5
+BATCHES = ((4, 4), (8, 16), (32, 1), (32, 2), (32, 4), (32, 8))  # agents, windows
+
+
+def in_turns(runs: Mapping[str, Callable[[], object]]) -> dict[str, float]:
+    """Median processor time of each, ms."""
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(REPETITIONS + 1):  # the first warms up
+        for name, run in runs.items():
+            start = time.process_time()
+            run()
+            times[name].append(1000 * (time.process_time() - start))
+    return {name: statistics.median(values[1:]) for name, values in times.items()}
+
+
+def flown(policies: list[ModGNN], settings: DAggerConfig, num_agents: int = 32) -> ReplayBuffer:
+    """Data for these policies."""
+    flocks = Flocks(FlockingConfig(), settings, 16, num_agents, policies, Reynolds(), steps=40, stretch=40, seed=0)
+    flocks.keep(flocks.fly(expert_share=1.0))
+    flocks.close()
+    return flocks.buffer
+
+
+def updates() -> None:
+    """Print the time of an optimiser step for each model."""
+    runs = {}
+    for name, layers, batch, receivers in UPDATES:
+        settings = DAggerConfig(batch_size=batch, receivers=receivers, capacity=2000)
+        learner = Learner(make_model(name, layers=layers, seed=0), settings, (100, 100), seed=0)
+        data = flown([learner.flown], settings)
+        runs[f"{name}, {layers} layer(s), {batch} x {receivers}"] = functools.partial(learner.fit, data, 1)
+    times = in_turns(runs)
+    first = next(iter(times.values()))
+    print("| update, states x receivers | ms | times |\n|---|---:|---:|")
+    for label, value in times.items():
+        print(f"| {label} | {value:.0f} | {value / first:.1f} |", flush=True)
+
+
+def one_by_one(policies: list[ModGNN], batch: TensorDictBase, receivers: torch.Tensor) -> None:
+    """Gradients of policies one after the other."""
+    for policy in policies:
+        imitation_loss(policy, batch, receivers).backward()
+
+
+def seeds() -> None:
+    """Print how much faster several seeds of one model learn at once, by the size of a batch of windows."""
+    print(f"\n| {SEEDS} seeds at once, windows x agents | " + " | ".join(f"{b} x {n}" for n, b in BATCHES) + " |")
+    print("|---|" + "---:|" * len(BATCHES))
+    for name in ("modgnn_mlp", "pair_force", "gcn"):
+        cells = []
+        for agents, windows in BATCHES:
+            policies = [make_model(name, seed=seed) for seed in range(SEEDS)]
+            batch = flown(policies, DAggerConfig(batch_size=windows, capacity=2000, hide_velocity=0.5), agents).sample()
+            receivers = batch["agents", "controlled"][:, -1]
+            times = in_turns(
+                {
+                    "loop": functools.partial(one_by_one, policies, batch, receivers),
+                    "at once": functools.partial(stacked_losses, policies, batch, receivers),
+                }
+            )
+            cells.append(f"{times['loop'] / times['at once']:.1f}")
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    prepare_torch("cpu", 1)
+    print(f"torch {torch.__version__}, {platform.machine()}, one thread; times faster than one after the other below\n")
+    updates()
+    seeds()
