@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -22,7 +23,7 @@ from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.collection import Flocks, flocks_of_all_sizes
 from modgnn_rl.trainers.journal import Journal
-from modgnn_rl.trainers.learner import fit_together, validate_together
+from modgnn_rl.trainers.learner import Learner, fit_together, validate_together
 from modgnn_rl.trainers.setup import DART_PARTS, make_learner, side_by_side
 
 __all__ = ["bc"]
@@ -71,9 +72,12 @@ def bc(
     validation = flocks_of_all_sizes(unseen_config, policies, expert, **flown)
     training = [] if settings.dataset else flocks_of_all_sizes(config, policies, expert, **flown)
     flights_at = [part * rounds // parts for part in range(parts)]
-    noise = settings.noise
+    noise, loss = settings.noise, 0.0
 
-    with Journal(run, logger, by_name, [*training, *validation], updates, settings, callbacks) as journal:
+    with (
+        _own_folders(run, members, by_name),
+        Journal(run, logger, by_name, [*training, *validation], updates, settings, callbacks) as journal,
+    ):
         if settings.dataset:
             buffers = [_share(settings.dataset, settings, validation[0], max(policy.window for policy in policies))]
         else:
@@ -83,7 +87,7 @@ def bc(
             buffers = [group.buffer for group in training]
         for index in range(rounds):
             for group in training * flights_at.count(index):
-                group.disturbance.scale = noise
+                group.disturbance.scale = noise = loss**0.5 if settings.dart and index else settings.noise
                 group.keep(journal.show(index + 1, group.fly(expert_share=1.0)))
             metrics = {"learning_rate": learners[0].learning_rate, "noise": noise}
             losses = []
@@ -98,15 +102,22 @@ def bc(
                 if (index + 1) % FLIGHT_ROUNDS == 0:
                     metrics |= _errors_in_flight(config, by_name, unseen.num_agents, expert)
             loss = sum(losses) / len(losses)
-            noise = loss**0.5 if settings.dart else noise
             if journal.note(index + 1, metrics, fitting * len(sizes), validation_loss=loss):
                 break
 
-    for name, member in members.items() if len(members) > 1 else ():
-        own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
-        learner = by_name[name]
-        save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.flown.state_dict()}, {})
     return dict(zip(by_name, policies, strict=True))
+
+
+@contextlib.contextmanager
+def _own_folders(run: RunFolder, members: Mapping[str, TrainConfig], by_name: Mapping[str, Learner]) -> Iterator[None]:
+    """At the end, after Ctrl-C too, give each of several policies a run folder of its own inside the run's."""
+    try:
+        yield
+    finally:
+        for name, member in members.items() if len(members) > 1 else ():
+            own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
+            learner = by_name[name]
+            save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.flown.state_dict()}, {})
 
 
 def _named(by_name: dict[str, Any], metric: str, values: Sequence[float]) -> dict[str, float]:

@@ -162,9 +162,9 @@ def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path
     # Tried out and flown for validation without noise; each part with the error of the round before it.
     after = [metrics[index]["4/validation_loss"] ** 0.5 for index in (9, 19, 29)]
     assert flown == pytest.approx([0.0, 0.1, *after])
-    assert [line["noise"] for line in metrics[1:]] == pytest.approx(
-        [line["4/validation_loss"] ** 0.5 for line in metrics[:-1]]
-    )
+    # The metric is the noise in the data of that part.
+    expected = [noise for noise in (0.1, *after) for _ in range(10)]
+    assert [line["noise"] for line in metrics] == pytest.approx(expected)
 
 
 @pytest.mark.usefixtures("_without_evaluation")
@@ -220,3 +220,15 @@ def test_fitting_together_is_fitting_each_alone_on_the_same_batches(models):
                 )
         assert together[number].updates_done == alone.updates_done == 12
         assert together[number].learning_rate == alone.learning_rate
+
+
+def test_each_policy_has_its_folder_after_an_interruption_too(tmp_path):
+    class Interrupt(Callback):
+        def on_round(self, index, metrics):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(_config(tmp_path, models=["gcn", "modgnn_mlp"]), callbacks=[Interrupt()])
+    (folder,) = tmp_path.iterdir()
+    for name in ("gcn-K1", "modgnn_mlp-K1"):
+        load_policy(folder / name)
