@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -19,17 +19,15 @@ from modgnn_rl.envs.leader import make_leader
 from modgnn_rl.envs.physics import Physics, TorchPhysics
 from modgnn_rl.envs.quadcopter import Dynamics
 from modgnn_rl.envs.radio import hear_all_pairs, hear_near_pairs
-from modgnn_rl.envs.rewards import flocking_costs, flocking_reward, reward_weights
+from modgnn_rl.envs.rewards import LIMITS, judge, reward_weights
 from modgnn_rl.envs.starts import start_positions
 from modgnn_rl.errors import InputError
-from modgnn_rl.metrics import is_diverged
 from modgnn_rl.seeds import derive_seed
 from modgnn_rl.settings import check, suggestion
 from modgnn_rl.tensors import clip_to_ball
 
 __all__ = ["FlockingEnv", "checked_config", "make_physics"]
 
-LIMITS = ("max_distance", "max_colliding", "collision_distance", "crowding_distance")
 AWAY = 1e4  # m; where agents that do not exist are kept, as far from each other
 
 
@@ -339,46 +337,6 @@ class FlockingEnv(EnvBase):
         """End the physics engine; the environment cannot be used any more."""
         self.physics.close()
         super().close(**kwargs)
-
-
-def judge(
-    position: Tensor,
-    velocity: Tensor,
-    target_velocity: Tensor,
-    nearest: Tensor,
-    sizes: Tensor,
-    exists: Tensor | None,
-    limits: Mapping[str, float],
-    weights: Mapping[str, float],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """What a step has brought.
-
-    Args:
-        position: m [B, N, 3].
-        velocity: m/s [B, N, 3].
-        target_velocity: what the agents were told, m/s [B, N, 3].
-        nearest: distance of the nearest other agent, m [B, N].
-        sizes: agents of each flock [B].
-        exists: agents that exist, bool [B, N]; default: all.
-        limits: the settings named in `LIMITS`.
-        weights: of the costs, see `modgnn_rl.envs.rewards`.
-
-    Returns:
-        state [B, N, 6], reward [B, N, 1], and whether the flight is over [B, 1].
-    """
-    touching = nearest < limits["collision_distance"]
-    colliding = touching.sum(-1) > limits["max_colliding"] * sizes
-    terminated = (is_diverged(position, limits["max_distance"], exists) | colliding).unsqueeze(-1)
-    costs = flocking_costs(
-        position,
-        velocity,
-        target_velocity,
-        nearest,
-        crowding_distance=limits["crowding_distance"],
-        collision_distance=limits["collision_distance"],
-        exists=exists,
-    )
-    return torch.cat((position, velocity), -1), flocking_reward(costs, weights, exists), terminated
 
 
 def checked_config(config: FlockingConfig | None, settings: dict[str, Any]) -> FlockingConfig:

@@ -1,7 +1,7 @@
 """What flocking is for, as a reward: follow the leader, keep together, keep apart, move as one, with little effort.
 
 It knows nothing of the expert. Each purpose is a cost of its own, zero at best; the reward is their weighted sum below
-zero.
+zero. `judge` adds whether a flight is over.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.metrics import is_diverged
 from modgnn_rl.tensors import squared_norm
 
-__all__ = ["COSTS", "flocking_costs", "flocking_reward", "reward_weights"]
+__all__ = ["COSTS", "LIMITS", "flocking_costs", "flocking_reward", "judge", "reward_weights"]
 
+LIMITS = ("max_distance", "max_colliding", "collision_distance", "crowding_distance")  # settings that `judge` reads
 COSTS = {
     "leader": "distance from the leader, m",
     "cohesion": "distance from the flock's centre of mass, m",
@@ -81,6 +83,46 @@ def flocking_reward(costs: Mapping[str, Tensor], weights: Mapping[str, float], e
     for name, weight in weights.items():
         reward = reward - weight * costs[name]
     return (reward if exists is None else torch.where(exists, reward, 0.0)).unsqueeze(-1)
+
+
+def judge(
+    position: Tensor,
+    velocity: Tensor,
+    target_velocity: Tensor,
+    nearest: Tensor,
+    sizes: Tensor,
+    exists: Tensor | None,
+    limits: Mapping[str, float],
+    weights: Mapping[str, float],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What a step has brought.
+
+    Args:
+        position: m [B, N, 3].
+        velocity: m/s [B, N, 3].
+        target_velocity: what the agents were told, m/s [B, N, 3].
+        nearest: distance of the nearest other agent, m [B, N].
+        sizes: agents of each flock [B].
+        exists: agents that exist, bool [B, N]; default: all.
+        limits: the settings named in `LIMITS`.
+        weights: of the costs, see `reward_weights`.
+
+    Returns:
+        state [B, N, 6], reward [B, N, 1], and whether the flight is over [B, 1].
+    """
+    touching = nearest < limits["collision_distance"]
+    colliding = touching.sum(-1) > limits["max_colliding"] * sizes
+    terminated = (is_diverged(position, limits["max_distance"], exists) | colliding).unsqueeze(-1)
+    costs = flocking_costs(
+        position,
+        velocity,
+        target_velocity,
+        nearest,
+        crowding_distance=limits["crowding_distance"],
+        collision_distance=limits["collision_distance"],
+        exists=exists,
+    )
+    return torch.cat((position, velocity), -1), flocking_reward(costs, weights, exists), terminated
 
 
 def _norm(vectors: Tensor) -> Tensor:
