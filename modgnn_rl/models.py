@@ -8,6 +8,7 @@ With several layers, each but the last puts out features that the next ones comm
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
 from modgnn_rl.equivariant import VELOCITY_SCALE, Moments, PairForce, VectorSquash, mlp
 from modgnn_rl.errors import InputError
 from modgnn_rl.modgnn import ModGNN, ModGNNLayer
+from modgnn_rl.seeds import seeded
 from modgnn_rl.settings import suggestion
 from modgnn_rl.tensors import clip_to_ball
 
@@ -293,9 +295,7 @@ def make_model(
         layers = LAYERS.get(name, 1)
     if not isinstance(layers, int) or layers < 1:
         raise InputError(f"layers={layers!r} is not a number of layers; expected an integer of at least 1")
-    with torch.random.fork_rng(devices=[], enabled=seed is not None):
-        if seed is not None:
-            torch.default_generator.manual_seed(seed)  # torch.manual_seed would also seed the accelerators
+    with contextlib.nullcontext() if seed is None else seeded(seed):
         built = []
         for earlier in range(layers):
             head = BallHead(max_speed) if earlier == layers - 1 else None

@@ -19,8 +19,6 @@ from torchrl.modules import IndependentNormal
 
 __all__ = ["GaussianActor"]
 
-AGENTS = "agents"
-
 
 class GaussianActor(ProbabilisticTensorDictSequential):
     """A policy whose actions are drawn around what it would do: ``a ~ N(policy(o), sigma^2)`` in each component.
@@ -41,10 +39,10 @@ class GaussianActor(ProbabilisticTensorDictSequential):
         policy: TensorDictModuleBase,
         noise: float = 0.3,
         *,
-        loc: NestedKey = (AGENTS, "loc"),
-        scale: NestedKey = (AGENTS, "scale"),
-        log_prob: NestedKey = (AGENTS, "action_log_prob"),
-        receivers: NestedKey = (AGENTS, "receivers"),
+        loc: NestedKey = ("agents", "loc"),
+        scale: NestedKey = ("agents", "scale"),
+        log_prob: NestedKey = ("agents", "action_log_prob"),
+        receivers: NestedKey = ("agents", "receivers"),
     ) -> None:
         mean = _Mean(policy, noise, loc, scale, receivers)
         sample = ProbabilisticTensorDictModule(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from tensordict import TensorDictBase
 
@@ -19,7 +19,7 @@ class Callback:
 
         class Print(Callback):
             def on_round(self, index, metrics):
-                print(index, metrics["32/error"])
+                print(index, metrics["error"])
 
         modgnn_rl.training.train(config, callbacks=[Print()])
     """
@@ -67,17 +67,17 @@ class StopOnPlateau(Callback):
     Args:
         rounds: how many rounds are compared with as many before.
         gain: smallest relative improvement.
-        names: metrics whose mean is looked at, one for each size of flocks; rounds without them do not count.
         after: rounds that are left out at first, while the expert still flies.
+        name: the metric; rounds without it do not count.
     """
 
-    def __init__(self, rounds: int, gain: float, names: Sequence[str], after: int = 0) -> None:
-        self.rounds, self.gain, self.names, self.after = rounds, gain, tuple(names), after
+    def __init__(self, rounds: int, gain: float, *, after: int = 0, name: str = "error") -> None:
+        self.rounds, self.gain, self.after, self.name = rounds, gain, after, name
         self.seen: list[float] = []
 
     def on_round(self, index: int, metrics: Mapping[str, float]) -> bool:
         """Look at the metric."""
-        value = sum(metrics.get(name, math.nan) for name in self.names) / len(self.names)
+        value = metrics.get(self.name, math.nan)
         if index > self.after and math.isfinite(value):
             self.seen.append(value)
         if len(self.seen) < 2 * self.rounds:

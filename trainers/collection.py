@@ -14,7 +14,8 @@ from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, ImitationCo
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.equivariant import is_equivariant
 from modgnn_rl.modgnn import ModGNN
-from modgnn_rl.seeds import derive_seed
+from modgnn_rl.seeds import derive_seed, seeded
+from modgnn_rl.trainers.imitation import are_alike
 from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture, SafetyGate, spread
 
 __all__ = [
@@ -32,14 +33,14 @@ __all__ = [
 class FlockCollector:
     """Flocks of one size that never stop flying, flown through TorchRL's `Collector`.
 
-    Each call of `fly` continues the flights where they were.
+    Each call of `continue_flights` goes on where they were.
 
     Args:
         config: the world.
         num_envs: flocks flown at once, B.
         num_agents: agents in each, N.
         behaviour: the modules that fly and label, in this order (weights changed in place are flown at once).
-        steps: steps of one call of `fly`.
+        steps: steps of one call of `continue_flights`.
         seed: seeds the environment, and the draws of modules that draw from torch's global generator.
         device: where flocks and data live.
     """
@@ -60,7 +61,7 @@ class FlockCollector:
             num_envs, num_agents, config=config, seed=derive_seed(seed, "env"), device=device, stagger=True
         )
         self.noise = torch.Generator().manual_seed(derive_seed(seed, "noise"))
-        with torch.random.fork_rng():  # the collector tries the policy out
+        with seeded(seed, device):  # the collector tries the policy out
             self.collector = Collector(
                 self.env,
                 TensorDictSequential(*behaviour),
@@ -76,8 +77,7 @@ class FlockCollector:
     def continue_flights(self) -> TensorDictBase:
         """Continue the flights by some steps; flights [B, T]. Torch's global generators are left as they were."""
         seed = int(torch.randint(2**31, (), generator=self.noise))
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
+        with seeded(seed, self.env.device):
             return next(self._flights)
 
     @property
@@ -211,8 +211,7 @@ def reservoir_places(
 
 def window_of(policies: Sequence[ModGNN], settings: ImitationConfig) -> int:
     """Steps of the windows that policies learn from: one, with the stored messages, where that is enough."""
-    alone = len({(str(policy), policy.hops) for policy in policies}) == 1
-    if alone and stores_messages(policies[0]) and not settings.hide_velocity:
+    if are_alike(policies) and stores_messages(policies[0]) and not settings.hide_velocity:
         return 1
     return max(policy.window for policy in policies)
 

@@ -67,8 +67,7 @@ def dagger(
     )
     names = [config.model.name, *(f"ensemble_{member}" for member in range(1, members))]
     if settings.plateau_rounds:
-        errors = [f"{size}/error" for size in sizes]
-        plateau = StopOnPlateau(settings.plateau_rounds, settings.plateau_gain, errors, after=settings.expert_rounds)
+        plateau = StopOnPlateau(settings.plateau_rounds, settings.plateau_gain, after=settings.expert_rounds)
         callbacks = [*callbacks, plateau]
 
     by_name = dict(zip(names, learners, strict=True))
@@ -94,8 +93,7 @@ def dagger(
                 group.keep(flights)
                 metrics |= flight_metrics(flights, config.env)
                 metrics[f"{group.num_agents}/loss"], *_ = fit_together(learners, group.buffer, fitting)
-            error = sum(metrics[f"{size}/error"] for size in sizes) / len(sizes)
-            metrics["error"] = error
+            metrics["error"] = error = sum(metrics[f"{size}/error"] for size in sizes) / len(sizes)
             round_ = f"{index + 1}/{settings.rounds}"
             if journal.note(index + 1, metrics, fitting * len(sizes), round=round_, error=error):
                 break

@@ -14,6 +14,7 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl.modgnn import ModGNN
 
 __all__ = [
+    "are_alike",
     "hide_velocities",
     "imitation_loss",
     "random_receivers",
@@ -95,6 +96,11 @@ def hide_velocities(batch: TensorDictBase, share: float, generator: torch.Genera
     lot = torch.rand(len(batch), generator=generator, device=generator.device).to(observation.device)
     hidden = (lot < share)[:, None, None, None] & (torch.arange(6, device=observation.device) >= 3)
     batch["agents", "observation"] = observation.masked_fill(hidden, 0.0)
+
+
+def are_alike(policies: Sequence[ModGNN]) -> bool:
+    """Whether policies differ in their weights only."""
+    return len({str(policy) + str([value.shape for value in policy.state_dict().values()]) for policy in policies}) == 1
 
 
 def _at_the_end(actions: Tensor, receivers: Tensor) -> Tensor:

@@ -40,7 +40,10 @@ class Learns(Protocol):
     """What a checkpoint is made of: a learner."""
 
     updates_done: int
-    generator: torch.Generator
+
+    @property
+    def generators(self) -> dict[str, torch.Generator]:
+        """All that draws at random there, by name."""
 
     @property
     def flown(self) -> ModGNN:
@@ -143,7 +146,7 @@ class Journal:
             prefix = f"{name}." if number else ""
             tensors |= {f"{prefix}{group}": values for group, values in of_learner.items()}
             state |= {f"{prefix}{key}": value for key, value in further.items()}
-            generators[f"{prefix}learner"] = learner.generator
+            generators |= {f"{prefix}{role}": generator for role, generator in learner.generators.items()}
         for number, group in enumerate(self.flocks):
             generators |= {f"{number}.{name}": generator for name, generator in group.generators.items()}
         tensors["generators"] = {name: generator.get_state() for name, generator in generators.items()}

@@ -19,6 +19,7 @@ from modgnn_rl.equivariant import is_equivariant
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.imitation import (
+    are_alike,
     hide_velocities,
     imitation_loss,
     random_receivers,
@@ -27,7 +28,7 @@ from modgnn_rl.trainers.imitation import (
     stacked_losses,
 )
 
-__all__ = ["Learner", "cosine_learning_rate", "fit_together", "validate_together"]
+__all__ = ["Learner", "cosine_learning_rate", "fit_together", "moments_of", "validate_together"]
 
 STACKED_PAIRS = 2048  # up to this many pairs of agents in a batch, several seeds learn faster as one
 
@@ -98,17 +99,26 @@ class Learner:
         self.averaged.update_parameters(self.policy)
         self.updates_done += 1
 
+    @property
+    def generators(self) -> dict[str, torch.Generator]:
+        """All that draws at random here, by name."""
+        return {"learner": self.generator}
+
     def state(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
         """What a checkpoint holds of the learner: named tensors, and plain values."""
-        moments = self.optimizer.state_dict()["state"]
-        optimizer = {f"{index}.{name}": value for index, entry in moments.items() for name, value in entry.items()}
         tensors = {
             "policy": self.flown.state_dict(),
             "trained": self.policy.state_dict(),
-            "optimizer": optimizer,
+            "optimizer": moments_of(self.optimizer),
         }
         averaged = int(self.averaged.n_averaged)
         return tensors, {"updates": self.updates_done, "averaged": averaged, "learning_rate": self.learning_rate}
+
+
+def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """What an optimiser remembers of each parameter, as named tensors."""
+    entries = optimizer.state_dict()["state"].items()
+    return {f"{index}.{name}": value for index, entry in entries for name, value in entry.items()}
 
 
 def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int) -> list[float]:
@@ -127,7 +137,7 @@ def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int
     """
     first, policies = learners[0], [learner.policy for learner in learners]
     turn = any(learner.turns for learner in learners)
-    alike = len(learners) > 1 and len({_blueprint(policy) for policy in policies}) == 1
+    alike = len(learners) > 1 and are_alike(policies)
     records = []
     for _ in range(updates):
         batch = buffer.sample()
@@ -152,11 +162,6 @@ def validate_together(learners: Sequence[Learner], buffer: ReplayBuffer) -> list
     batch = buffer.sample()
     receivers = learners[0].prepare(batch, turn=any(learner.turns for learner in learners))
     return [float(imitation_loss(learner.flown, batch, receivers)) for learner in learners]
-
-
-def _blueprint(policy: ModGNN) -> str:
-    """What a policy is made of, whatever its weights."""
-    return f"{policy}{[(name, value.shape) for name, value in policy.state_dict().items()]}"
 
 
 def cosine_learning_rate(step: int, rates: Sequence[float], updates: tuple[int, int]) -> float:

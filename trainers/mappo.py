@@ -74,8 +74,9 @@ def mappo(
                 metrics |= flight_metrics(flights, world) | reward_metrics(flights, world)
                 losses = learner.improve(flights, only_critic=index < settings.critic_warmup, anchor=anchor)
                 metrics |= {f"{group.num_agents}/{name}": value for name, value in losses.items()}
-            reward = sum(metrics[f"{size}/reward"] for size in sizes) / len(sizes)
-            if journal.note(index + 1, metrics, 1, reward=reward):
+            for key in ("reward", "error"):
+                metrics[key] = sum(metrics[f"{size}/{key}"] for size in sizes) / len(sizes)
+            if journal.note(index + 1, metrics, 1, reward=metrics["reward"], error=metrics["error"]):
                 break
 
     return {name: learner.flown}

@@ -15,13 +15,14 @@ from torchrl.objectives import MAPPOLoss, ValueEstimators
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, MAPPOConfig
 from modgnn_rl.modgnn import ModGNN
-from modgnn_rl.seeds import derive_seed
+from modgnn_rl.seeds import derive_seed, seeded
 from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.collection import as_windows
 from modgnn_rl.trainers.critic import FlockCritic
 from modgnn_rl.trainers.imitation import random_receivers
+from modgnn_rl.trainers.learner import moments_of
 
-__all__ = ["AnchoredMAPPOLoss", "Improver"]
+__all__ = ["AnchoredMAPPOLoss", "Improver", "improvement_window"]
 
 ANCHOR = ("agents", "anchor")
 RECEIVERS = ("agents", "receivers")
@@ -67,6 +68,14 @@ class AnchoredMAPPOLoss(MAPPOLoss):
         return losses
 
 
+def improvement_window(policy: ModGNN, settings: MAPPOConfig) -> tuple[int, int]:
+    """Burn-in and length of the windows that a policy is improved on, in steps.
+
+    After the burn-in messages are exact whatever the weights were. Where stored ones are exact, a window is one step.
+    """
+    return (0, 1) if policy.sends_plain_data else (policy.hops, policy.hops + settings.window)
+
+
 class Improver:
     """Improves a policy on flights of its own: actor, critic, optimisers, and the moving average of the policy.
 
@@ -75,6 +84,9 @@ class Improver:
         settings: how.
         state: key of the true states, which the critic sees.
         seed: seeds the order of batches and the choice of receivers.
+
+    Attributes:
+        burn_in, window: see `improvement_window`.
     """
 
     def __init__(self, policy: ModGNN, settings: MAPPOConfig, state: Any, seed: int) -> None:
@@ -86,8 +98,7 @@ class Improver:
         self.generator = torch.Generator().manual_seed(derive_seed(seed, "receivers"))
         self.order = torch.Generator(device).manual_seed(derive_seed(seed, "order"))
         self.actor = GaussianActor(policy, settings.noise).to(device)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(derive_seed(seed, "critic"))
+        with seeded(derive_seed(seed, "critic")):
             self.critic = FlockCritic(state, hidden=settings.critic_hidden).to(device)
         self.loss = AnchoredMAPPOLoss(
             self.actor,
@@ -113,6 +124,7 @@ class Improver:
             {"params": list(self.critic.parameters()), "lr": settings.critic_learning_rate},
         ]
         self.optimizer = torch.optim.Adam(groups)
+        self.burn_in, self.window = improvement_window(policy, settings)
         self.updates_done = 0
 
     @property
@@ -121,9 +133,9 @@ class Improver:
         return cast(ModGNN, self.averaged.module)
 
     @property
-    def burn_in(self) -> int:
-        """Steps before a window after which its messages are exact; none where the stored ones are."""
-        return 0 if self.policy.sends_plain_data else self.policy.hops
+    def generators(self) -> dict[str, torch.Generator]:
+        """All that draws at random here, by name."""
+        return {"receivers": self.generator, "order": self.order}
 
     @torch.no_grad()
     def judge(self, flights: TensorDictBase) -> None:
@@ -134,8 +146,8 @@ class Improver:
         collide.
         """
         settings = self.settings
-        judged = flights.clone()
-        judged["next", "agents", "reward"] *= 1 - settings.discount
+        judged = flights.copy()
+        judged["next", "agents", "reward"] = (1 - settings.discount) * flights["next", "agents", "reward"]
         judged["next", "terminated"] = torch.zeros_like(judged["next", "terminated"])
         self.loss.value_estimator(judged)
         controlled = flights["agents", "controlled"].unsqueeze(-1)
@@ -161,14 +173,13 @@ class Improver:
         settings = self.settings
         self.loss.anchor_coeff = 0.0 if only_critic else anchor
         self.judge(flights)
-        length = self.burn_in + (1 if self.burn_in == 0 else settings.window)
         kept = [
             *self.policy.in_keys,
             *(("agents", name) for name in ("controlled", "action", "action_log_prob", "advantage", "value_target")),
             self.critic.state_key,
             ANCHOR,
         ]
-        windows = as_windows(flights.select(*kept, strict=False), length, length - self.burn_in)
+        windows = as_windows(flights.select(*kept, strict=False), self.window, self.window - self.burn_in)
         buffer = ReplayBuffer(
             storage=LazyTensorStorage(len(windows), device=self.device, compilable=True),
             sampler=SamplerWithoutReplacement(),
@@ -209,15 +220,12 @@ class Improver:
 
     def state(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
         """What a checkpoint holds: named tensors, and plain values."""
-        moments = self.optimizer.state_dict()["state"]
         tensors = {
             "policy": self.flown.state_dict(),
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
             "value_norm": self.loss.value_norm.state_dict(),
             "anchor": self.anchor.state_dict(),
-            "optimizer": {
-                f"{index}.{name}": value for index, entry in moments.items() for name, value in entry.items()
-            },
+            "optimizer": moments_of(self.optimizer),
         }
         return tensors, {"updates": self.updates_done, "averaged": int(self.averaged.n_averaged)}

@@ -25,6 +25,7 @@ from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.collection import window_of
 from modgnn_rl.trainers.learner import Learner
+from modgnn_rl.trainers.ppo import improvement_window
 
 __all__ = ["DART_PARTS", "check_training", "initial_policy", "make_learner", "settle_model", "side_by_side"]
 
@@ -109,9 +110,7 @@ def _members(config: TrainConfig) -> list[TrainConfig]:
 def _check_flights(settings: TrainerConfig, policies: Sequence[ModGNN]) -> None:
     """Refuse flights shorter than the windows that are cut from them."""
     if isinstance(settings, MAPPOConfig):
-        policy = policies[0]
-        name, steps = "round_steps", settings.round_steps
-        needed = 1 if policy.sends_plain_data else policy.hops + settings.window
+        name, steps, needed = "round_steps", settings.round_steps, improvement_window(policies[0], settings)[1]
     elif isinstance(settings, DAggerConfig):
         name, steps, needed = "round_steps", settings.round_steps, window_of(policies, settings)
     elif isinstance(settings, BCConfig) and not settings.dataset:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -121,9 +122,9 @@ def test_a_callback_that_fails_ends_the_run_with_its_own_error(tmp_path):
 
 
 def _steps_until_stop(values, **settings):
-    plateau = StopOnPlateau(**{"rounds": 2, "gain": 0.1, "names": ["4/error"], **settings})
+    plateau = StopOnPlateau(**{"rounds": 2, "gain": 0.1, **settings})
     for index, value in enumerate(values, start=1):
-        metrics = value if isinstance(value, dict) else {"4/error": value}
+        metrics = value if isinstance(value, dict) else {"error": value}
         if plateau.on_round(index, metrics):
             return index
     return None
@@ -145,14 +146,20 @@ def test_rounds_without_the_metric_and_the_first_ones_do_not_count():
     assert _steps_until_stop([1.0] * 20, after=6) == 10
 
 
-def test_a_plateau_of_several_sizes_is_that_of_their_mean():
-    names = ["4/error", "8/error"]
-    metrics = [{"4/error": 0.7**k, "8/error": 1.0} for k in range(20)]
-    alone = _steps_until_stop(metrics)
-    together = _steps_until_stop(metrics, names=names)
-    assert alone is None
-    assert together is not None
-    assert _steps_until_stop([{"4/error": 1.0}] * 20, names=names) is None
+def test_a_plateau_may_be_that_of_another_metric():
+    metrics = [{"error": 0.7**k, "8/error": 1.0} for k in range(20)]
+    assert _steps_until_stop(metrics) is None
+    assert _steps_until_stop(metrics, name="8/error") == 4
+
+
+@pytest.mark.parametrize("name", ["dagger", "mappo"])
+def test_the_error_of_a_round_is_the_mean_over_the_sizes(tmp_path, name):
+    config = dataclasses.replace(_config(tmp_path, TRAINERS[name]), env=FlockingConfig(num_agents=[3, 4]))
+    run = train(config)
+    for line in run.read_metrics():
+        if line["step"] > 0:
+            assert line["error"] == pytest.approx((line["3/error"] + line["4/error"]) / 2, nan_ok=True)
+    assert math.isfinite(run.read_metrics()[-1]["error"])
 
 
 @pytest.mark.parametrize("name", ["bc", "dagger"])

@@ -94,7 +94,7 @@ def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
     assert set(checkpoint.tensors) == {"policy", "actor", "critic", "value_norm", "anchor", "optimizer", "generators"}
     drawn = {"env", "faults", "noise"}
     names = {f"{number}.{size}.{name}" for number, size in enumerate((3, 5)) for name in drawn}
-    assert set(checkpoint.tensors["generators"]) == {"learner", *names}
+    assert set(checkpoint.tensors["generators"]) == {"receivers", "order", *names}
     assert checkpoint.step == checkpoint.state["updates"] == 3 * 2 * 4  # rounds, sizes, updates
     assert checkpoint.state["averaged"] == 2 * 2 * 4  # but for the critic's first round
     assert checkpoint.state["config"] == run.config
