@@ -24,11 +24,11 @@ __all__ = [
     "ExportConfig",
     "FlockingConfig",
     "ImitationConfig",
-    "LoggerConfig",
     "MAPPOConfig",
     "ModelConfig",
     "TrainConfig",
     "TrainerConfig",
+    "WandbConfig",
     "WorldChanges",
     "as_list",
 ]
@@ -46,6 +46,7 @@ MODEL_NAMES = (
     "gat",
     "mpnn",
 )
+LOGGER_NAMES = ("none", "csv", "tensorboard", "wandb")
 REFERENCE_SIZE = 32  # the flock size to which start_radius, num_envs and receivers refer
 
 
@@ -116,6 +117,12 @@ class FlockingConfig:
     drag: float = setting(0.0, "drag of the rotors, as a multiple of the Crazyflie's as measured", low=0)
     motor_lag: float = setting(0.0, "time constant with which rotor thrusts follow their commands, s", low=0)
     compile: bool = setting(False, "compile physics, graph and expert: seconds at the start, then faster")
+    on_nonfinite: str = setting(
+        "stop",
+        "what happens when the state or the action of an agent is no number any more: stop with an error, or begin "
+        "that flock anew",
+        choices=("stop", "restart"),
+    )
 
     message_loss: float = setting(
         0.0, "fault: probability that a message does not arrive, for each link and step", low=0, high=1
@@ -216,7 +223,18 @@ class TrainerConfig:
     )
     averaging: float = setting(0.995, "decay of the moving average of the weights, which is evaluated", low=0, high=1)
     max_gradient: float = setting(1.0, "gradients are clipped to this norm", above=0)
-    checkpoint_minutes: float = setting(1.0, "time between two checkpoints, min", low=0)
+    checkpoint_minutes: float = setting(
+        1.0,
+        "time between two checkpoints, min; longer where writing would take more than 1.5 % of it; 0: after each round",
+        low=0,
+    )
+    keep_checkpoints: int = setting(2, "checkpoints kept, beside the best policy", low=1)
+    checkpoint_data: bool = setting(
+        True, "keep the data learned from in checkpoints: large, but a run that is resumed ends as if it never stopped"
+    )
+    on_nonfinite: str = setting(
+        "stop", "when a loss or a gradient is no number: stop, or skip that update", choices=("stop", "skip")
+    )
 
 
 @dataclass
@@ -243,6 +261,7 @@ class ImitationConfig(TrainerConfig):
     hide_velocity: float = setting(
         0.0, "share of the states of a batch in which all velocities are hidden", low=0, high=1
     )
+    held_out: int = setting(8, "flocks whose flights are kept for the validation error", low=1)
 
 
 @dataclass
@@ -252,7 +271,6 @@ class BCConfig(ImitationConfig):
     name: str = setting("bc", "trainer", choices=("bc",))
     cloning_steps: int = setting(1000, "steps that the expert flies", low=1)
     cloning_updates: int = setting(6000, "updates on its flights, shared by the sizes", low=1)
-    held_out: int = setting(8, "flocks whose flights are kept for the validation error", low=1)
     models: Any = setting(
         None, "models trained side by side on the same batches, a list; null: model.name", choices=MODEL_NAMES
     )
@@ -331,17 +349,14 @@ class MAPPOConfig(TrainerConfig):
 
 
 @dataclass
-class LoggerConfig:
-    """Where the metrics go besides the plain files, which are always written."""
+class WandbConfig:
+    """Weights & Biases, where ``logger`` names it."""
 
-    name: str = setting("none", "dashboard to write for", choices=("none", "csv", "tensorboard", "wandb"))
-    project: str = setting("modgnn_rl", "project in Weights & Biases")
-    mode: str = setting(
-        "offline", "whether Weights & Biases sends the run while it trains", choices=("offline", "online", "disabled")
-    )
-    init_timeout: float = setting(
-        10.0, "longest wait for the Weights & Biases server at the start and at the end, s", above=0, high=15
-    )
+    project: str = setting("modgnn_rl", "project that the run goes into")
+    entity: str | None = setting(None, "whose project: a user or a team; null: your own")
+    group: str | None = setting(None, "group of runs that the run is one of; null: none")
+    mode: str = setting("offline", "whether the run is sent while it trains", choices=("offline", "online", "disabled"))
+    init_timeout: float = setting(8.0, "longest wait for the server at the start and at the end, s", above=0, high=12)
 
 
 @dataclass
@@ -361,8 +376,15 @@ class TrainConfig:
     env: FlockingConfig = field(default_factory=FlockingConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     trainer: Any = MISSING
-    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    logger: Any = setting("none", "dashboards to write for beside the plain files, one or a list", choices=LOGGER_NAMES)
+    wandb: WandbConfig = field(default_factory=WandbConfig)
+    video_rounds: int = setting(
+        20, "logger=tensorboard or wandb: a film of a flight each so many rounds; 0: none", low=0
+    )
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    resume: str | None = setting(
+        None, "run folder of a run to go on with; its settings are taken from there, but for those given beside it"
+    )
     init_from: str | None = setting(
         None, "run folder whose policy training begins with, and whose model it keeps; null: a fresh one"
     )
@@ -394,6 +416,7 @@ class EvaluateConfig:
     """Evaluation of a finished run."""
 
     run: str = setting(MISSING, "run folder")
+    checkpoint: str = setting("last", "which policy: the last, or the best while it trained", choices=("last", "best"))
     env: Any = field(default_factory=WorldChanges)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")

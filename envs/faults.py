@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.envs.snapshots import Stateful
 
 __all__ = ["Faults"]
 
 
-class Faults:
+class Faults(Stateful):
     """The faults of B flocks of N agents; see the settings of `FlockingConfig` that begin with "fault:".
 
     Attributes:
@@ -32,6 +33,8 @@ class Faults:
         device: where they are.
         dtype: floating-point type.
     """
+
+    STATE = ("running", "reach", "gust", "late")
 
     def __init__(
         self, config: FlockingConfig, num_envs: int, num_agents: int, device: torch.device, dtype: torch.dtype

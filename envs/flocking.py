@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -16,18 +16,20 @@ from modgnn_rl.compiling import compiled
 from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, as_list
 from modgnn_rl.envs.faults import Faults
 from modgnn_rl.envs.leader import make_leader
-from modgnn_rl.envs.physics import Physics, TorchPhysics
-from modgnn_rl.envs.quadcopter import Dynamics
+from modgnn_rl.envs.nonfinite import complaint, lost_flocks, unusable
+from modgnn_rl.envs.physics import TorchPhysics, make_physics
 from modgnn_rl.envs.radio import hear_all_pairs, hear_near_pairs
 from modgnn_rl.envs.rewards import LIMITS, judge, reward_weights
+from modgnn_rl.envs.snapshots import refuse_foreign
 from modgnn_rl.envs.starts import start_positions
 from modgnn_rl.errors import InputError
 from modgnn_rl.seeds import derive_seed
 from modgnn_rl.settings import check, suggestion
 from modgnn_rl.tensors import clip_to_ball
 
-__all__ = ["FlockingEnv", "checked_config", "make_physics"]
+__all__ = ["FlockingEnv", "checked_config"]
 
+PARTS = ("physics", "leader", "faults")  # what has a state of its own
 AWAY = 1e4  # m; where agents that do not exist are kept, as far from each other
 
 
@@ -72,7 +74,9 @@ class FlockingEnv(EnvBase):
         generator, faults.generator: where starts and leaders come from; where faults come from.
 
     Raises:
-        InputError: on a setting out of range, an action of another shape or not finite, or a state that is no number.
+        InputError: on a setting out of range, an action of another shape, or a given state that is not finite.
+        NotFinite: on an action or a state that is not finite, with ``on_nonfinite="stop"``. With ``"restart"`` there
+            is a RuntimeWarning instead; the step of such a flock ends where it began, and the flock is terminated.
     """
 
     group_map: dict[str, list[str]]
@@ -221,27 +225,44 @@ class FlockingEnv(EnvBase):
                 f"reset(..., set_state=True) needs positions and velocities of shape {expected} under "
                 f"('agents', 'state'); there is {found}"
             )
-        self._refuse_nonfinite(state, self.exists, "state", "give finite positions, m, and velocities, m/s")
         state = state.to(self.dtype)
+        bad = unusable(state, self.exists)
+        if bad is not None:
+            reason = complaint("state", state, bad, self.step_count)
+            raise InputError(f"{reason}; give finite positions, m, and velocities, m/s")
+        state = state.masked_fill(~self.exists.unsqueeze(-1), 0.0)
         return torch.cat((self._send_away(state[..., :3], self.exists), state[..., 3:]), -1)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         config = self.config
         push = self.faults.step()
         flown = self._controlled()
-        action = self._checked_action(tensordict["agents", "action"], flown)
+        before = self.physics.position, self.physics.velocity
+        action = self._checked_action(tensordict["agents", "action"])
+        lost = lost_flocks("action", action, self.step_count, config.on_nonfinite, flown)
+        if lost:
+            action = action.index_fill(0, torch.tensor(lost, device=self.device), 0.0)
         target = torch.where(flown.unsqueeze(-1), clip_to_ball(action, config.max_speed), 0.0)
-        target[:, 0] = self.leader.step(self.physics.position[:, 0], self.generator)
+        target[:, 0] = self.leader.step(before[0][:, 0], self.generator)
         self.target_velocity = target
         self.physics.step(target, push)
+        position, velocity = self.physics.position, self.physics.velocity
+        # Rows that do not exist are looked at too: what is NaN there would reach the distances of the others.
+        lost += lost_flocks("state", torch.cat((position, velocity), -1), self.step_count, config.on_nonfinite)
+        if lost:
+            rows = torch.tensor(sorted(set(lost)), device=self.device)
+            self.physics.reset(rows, *(part[rows] for part in before))
+            position, velocity = self.physics.position, self.physics.velocity
+            target[lost] = 0.0
         self.step_count = self.step_count + 1
 
-        position, velocity = self.physics.position, self.physics.velocity
         adjacency, nearest = self._hear(position)
         exists = self.exists if self.is_mixed else None
         state, reward, terminated = self._judge(
             position, velocity, target, nearest, self.sizes, exists, self._limits, self._weights
         )
+        if lost:
+            terminated[lost] = True
         truncated = self.step_count >= config.max_steps
         return self._emit(state, adjacency).update(
             {
@@ -287,28 +308,40 @@ class FlockingEnv(EnvBase):
             device=self.device,
         )
 
-    def _checked_action(self, action: Tensor, flown: Tensor) -> Tensor:
+    def _checked_action(self, action: Tensor) -> Tensor:
         expected = (*self.batch_size, self.num_agents, 3)
         if tuple(action.shape) != expected:
             raise InputError(
                 f"the action has shape {tuple(action.shape)}; this environment expects {expected}: a target velocity, "
                 "m/s, for each agent of each flock"
             )
-        self._refuse_nonfinite(action, flown, "action", "a policy must give three finite numbers, m/s")
         return action.to(self.dtype)
 
-    def _refuse_nonfinite(self, value: Tensor, counts: Tensor, name: str, remedy: str) -> None:
-        """Refuse values [B, N, D] that are not finite in agents that count, bool [B, N]."""
-        if value.isfinite().all():
-            return
-        bad = ~value.isfinite().all(-1) & counts
-        if bad.any():
-            flock, agent = bad.nonzero()[0].tolist()
-            step = int(self.step_count[flock])
-            raise InputError(
-                f"the {name} of agent {agent} in flock {flock} at step {step} is not finite "
-                f"({value[flock, agent].tolist()}); {remedy}"
-            )
+    def snapshot(self) -> dict[str, Tensor]:
+        """A copy of all that the flights continue from, but for `generator` and ``faults.generator``.
+
+        Returns:
+            by name, such as ``"physics.position"`` [B, N, 3] or ``"step_count"`` [B, 1].
+        """
+        own = {name: getattr(self, name).clone() for name in ("sizes", "step_count", "target_velocity")}
+        states = {part: getattr(self, part).snapshot() for part in PARTS}
+        return own | {f"{part}.{name}": value for part, state in states.items() for name, value in state.items()}
+
+    def restore(self, snapshot: Mapping[str, Tensor]) -> None:
+        """Go on from a copy of what `snapshot` gave; with the generators and the last tensordict, bit for bit.
+
+        `modgnn_rl.envs.bullet.BulletPhysics.restore` says where PyBullet is only almost as exact.
+
+        Raises:
+            InputError: it is of other flocks, agents or settings.
+        """
+        refuse_foreign(snapshot, self.snapshot())
+        for part in PARTS:
+            named = {name.removeprefix(f"{part}."): value for name, value in snapshot.items() if name.startswith(part)}
+            getattr(self, part).restore(named)
+        for name in ("step_count", "target_velocity"):
+            setattr(self, name, snapshot[name].to(self.device, copy=True))
+        self._stagger_next_reset = False
 
     def compile(self, **kwargs: Any) -> FlockingEnv:
         """Compile physics, graph and reward, also when built with ``compile=True``, and return the environment.
@@ -350,30 +383,3 @@ def checked_config(config: FlockingConfig | None, settings: dict[str, Any]) -> F
     config = config if config is not None else FlockingConfig(**settings)
     check(config, "env")
     return config
-
-
-def make_physics(
-    config: FlockingConfig, num_envs: int, num_agents: int, device: torch.device, dtype: torch.dtype
-) -> Physics:
-    """Build the engine that ``config.physics`` names for B flocks of N agents.
-
-    Raises:
-        InputError: when it does not have what the configuration asks of it.
-    """
-    dynamics = Dynamics(
-        period=1 / config.control_frequency,
-        substeps=config.physics_substeps,
-        velocity_gain=config.velocity_gain,
-        linear_damping=config.linear_damping,
-        angular_damping=config.angular_damping,
-        drag=config.drag,
-        motor_lag=config.motor_lag,
-        ground=config.ground,
-    )
-    if config.physics == "bullet":
-        from modgnn_rl.envs.bullet import BulletPhysics  # imports pybullet, which nothing else needs
-
-        return BulletPhysics(num_envs, num_agents, dynamics, collisions=config.collisions, device=device, dtype=dtype)
-    if config.collisions:
-        raise InputError("env.collisions=true needs env.physics=bullet; the torch physics lets agents pass each other")
-    return TorchPhysics(num_envs, num_agents, dynamics, device=device, dtype=dtype)

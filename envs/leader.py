@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.envs.snapshots import Stateful
 from modgnn_rl.tensors import clip_to_ball
 
 __all__ = ["CircleLeader", "Leader", "NoiseLeader", "WaypointLeader", "make_leader"]
@@ -15,7 +16,7 @@ __all__ = ["CircleLeader", "Leader", "NoiseLeader", "WaypointLeader", "make_lead
 ARRIVED = 0.3  # m from a waypoint
 
 
-class Leader(ABC):
+class Leader(Stateful, ABC):
     """The target velocities of the leaders of B flocks.
 
     Args:
@@ -46,6 +47,8 @@ class Leader(ABC):
 class NoiseLeader(Leader):
     """Integrated noise: ``v <- clip(v + N(0, leader_noise^2 dt))``, from rest."""
 
+    STATE = ("velocity",)
+
     def __init__(self, config: FlockingConfig, num_envs: int, device: torch.device, dtype: torch.dtype) -> None:
         super().__init__(config, num_envs, device, dtype)
         self.velocity = self.zero
@@ -64,6 +67,8 @@ class NoiseLeader(Leader):
 
 class WaypointLeader(Leader):
     """Straight to a waypoint at ``leader_speed``, then to the next: uniform in the ball of ``leader_radius``."""
+
+    STATE = ("waypoint",)
 
     def __init__(self, config: FlockingConfig, num_envs: int, device: torch.device, dtype: torch.dtype) -> None:
         super().__init__(config, num_envs, device, dtype)
@@ -87,6 +92,8 @@ class WaypointLeader(Leader):
 
 class CircleLeader(Leader):
     """A level circle of ``leader_radius`` at ``leader_speed``, begun in a random direction."""
+
+    STATE = ("heading",)
 
     def __init__(self, config: FlockingConfig, num_envs: int, device: torch.device, dtype: torch.dtype) -> None:
         super().__init__(config, num_envs, device, dtype)

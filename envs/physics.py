@@ -7,19 +7,21 @@ engine can be added here without touching it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from modgnn_rl.compiling import compiled
+from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.controller import Rotors, mix_rotors, rotor_wrench, velocity_controller
 from modgnn_rl.envs.quadcopter import Dynamics
 from modgnn_rl.envs.rigid_body import Bodies, rotor_drag, step_bodies
 from modgnn_rl.envs.vectors import Components, Vector, add, rotation_matrix, to_body_frame
+from modgnn_rl.errors import InputError
 
-__all__ = ["Flight", "Physics", "TorchPhysics", "fly"]
+__all__ = ["Flight", "Physics", "TorchPhysics", "fly", "make_physics"]
 
 Move = Callable[[Bodies, Tensor, Vector, Dynamics, int, Components | None], Bodies]
 
@@ -68,6 +70,12 @@ class Physics(Protocol):
             target_velocity: m/s [B, N, 3].
             push: acceleration from outside, such as wind, m/s^2, broadcast to [B, N, 3].
         """
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """A copy of all that flights continue from, by name [B, N, C], in the precision that the engine computes in."""
+
+    def restore(self, snapshot: Mapping[str, Tensor]) -> None:
+        """Go on from a copy of what `snapshot` gave, whatever device it is on."""
 
     def close(self) -> None:
         """Free what the engine holds."""
@@ -161,6 +169,23 @@ class TorchPhysics:
         air = None if push is None else push.unbind(-1)
         self.flight = self._fly(self.flight, target_velocity.unbind(-1), air, self.dynamics)
 
+    def snapshot(self) -> dict[str, Tensor]:
+        """A copy of the state, see `Physics.snapshot`."""
+        bodies, integral, rotors = self.flight
+        parts = {**bodies._asdict(), "integral": integral, **({"rotors": rotors} if rotors else {})}
+        return {name: torch.stack(tuple(part), -1) for name, part in parts.items()}
+
+    def restore(self, snapshot: Mapping[str, Tensor]) -> None:
+        """Go on from a snapshot, see `Physics.restore`."""
+        device = self.flight.integral[0].device
+        # Components are contiguous, as after a step: the same arithmetic, to the last bit, and no new compiling.
+        parts: dict[str, Any] = {
+            name: tuple(part.to(device).clone(memory_format=torch.contiguous_format) for part in value.unbind(-1))
+            for name, value in snapshot.items()
+        }
+        bodies = Bodies(*(parts[name] for name in Bodies._fields))
+        self.flight = Flight(bodies, parts["integral"], parts.get("rotors", ()))
+
     def compile(self) -> None:
         """Compile a control period into one function."""
         self._fly = compiled(fly)
@@ -218,3 +243,30 @@ def _follow(rotors: Rotors, commands: Rotors, lag: float) -> Rotors:
 def _replace(old: Components, rows: Tensor, new: Tensor) -> Any:
     """Components [B, N] with those of the flocks ``rows`` taken from ``new`` [R, N, C]."""
     return tuple(part.index_copy(0, rows, value) for part, value in zip(old, new.unbind(-1), strict=True))
+
+
+def make_physics(
+    config: FlockingConfig, num_envs: int, num_agents: int, device: torch.device, dtype: torch.dtype
+) -> Physics:
+    """Build the engine that ``config.physics`` names for B flocks of N agents.
+
+    Raises:
+        InputError: when it does not have what the configuration asks of it.
+    """
+    dynamics = Dynamics(
+        period=1 / config.control_frequency,
+        substeps=config.physics_substeps,
+        velocity_gain=config.velocity_gain,
+        linear_damping=config.linear_damping,
+        angular_damping=config.angular_damping,
+        drag=config.drag,
+        motor_lag=config.motor_lag,
+        ground=config.ground,
+    )
+    if config.physics == "bullet":
+        from modgnn_rl.envs.bullet import BulletPhysics  # imports pybullet, which nothing else needs
+
+        return BulletPhysics(num_envs, num_agents, dynamics, collisions=config.collisions, device=device, dtype=dtype)
+    if config.collisions:
+        raise InputError("env.collisions=true needs env.physics=bullet; the torch physics lets agents pass each other")
+    return TorchPhysics(num_envs, num_agents, dynamics, device=device, dtype=dtype)

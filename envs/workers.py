@@ -23,7 +23,7 @@ from modgnn_rl.envs.flocking import FlockingEnv, checked_config
 from modgnn_rl.errors import InputError
 from modgnn_rl.seeds import derive_seed
 
-__all__ = ["ParallelFlocks", "parallel_flocks"]
+__all__ = ["ParallelFlocks", "make_flocks", "parallel_flocks"]
 
 
 class ParallelFlocks(ParallelEnv):
@@ -105,7 +105,7 @@ def parallel_flocks(
     seeds = [None if seed is None else derive_seed(seed, "worker", index) for index in range(workers)]
     return ParallelFlocks(
         workers,
-        _make_flocks,
+        make_flocks,
         create_env_kwargs=[{**common, "seed": own} for own in seeds],
         num_threads=torch.get_num_threads(),
         mp_start_method="spawn",
@@ -115,8 +115,8 @@ def parallel_flocks(
     )
 
 
-def _make_flocks(**kwargs: Any) -> FlockingEnv:
-    """The environment of a worker, in its process."""
+def make_flocks(**kwargs: Any) -> FlockingEnv:
+    """The environment of a worker, in its process: Ctrl-C is left to the parent, and the process ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
     return FlockingEnv(**kwargs)

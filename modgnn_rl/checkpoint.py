@@ -19,7 +19,7 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,13 +32,14 @@ from torch import Tensor
 from modgnn_rl.errors import InputError
 from modgnn_rl.files import fsync_file, fsync_folder, sha256
 
-__all__ = ["SCHEMA_VERSION", "Checkpoint", "load_checkpoint", "save_checkpoint"]
+__all__ = ["SCHEMA_VERSION", "Checkpoint", "has_checkpoint", "load_checkpoint", "save_checkpoint"]
 
 SCHEMA_VERSION = 1
 
 # A checkpoint that is being replaced by another of the same step is called `.old` until the new one stands.
 _NAME = re.compile(r"step_\d{9,}(\.old)?")
 _LEFTOVER = re.compile(r"step_\d{9,}(\.old|\.tmp)")
+_TENSORS = ".safetensors"
 _DAMAGE = (OSError, ValueError, RecursionError, SafetensorError)
 
 
@@ -110,12 +111,23 @@ def save_checkpoint(
     return path
 
 
-def load_checkpoint(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu") -> Checkpoint:
+def has_checkpoint(folder: str | os.PathLike[str]) -> bool:
+    """Whether there is a checkpoint in a folder, whole or not."""
+    return bool(_checkpoints(Path(folder)))
+
+
+def load_checkpoint(
+    folder: str | os.PathLike[str],
+    *,
+    device: torch.device | str = "cpu",
+    groups: Container[str] | None = None,
+) -> Checkpoint:
     """Read the newest checkpoint that is whole; a damaged one is passed over with a warning.
 
     Args:
         folder: where the checkpoints of a run lie.
         device: where to put the tensors.
+        groups: names of the groups of tensors to verify and read; default: all.
 
     Raises:
         InputError: there is no checkpoint, or every one is damaged.
@@ -123,7 +135,7 @@ def load_checkpoint(folder: str | os.PathLike[str], *, device: torch.device | st
     reasons = []
     for path in _checkpoints(Path(folder)):
         try:
-            found = _read(path)
+            found = _read(path, groups)
         except _DAMAGE as error:
             reasons.append(f"{path.name}: {error}")
             warnings.warn(
@@ -148,9 +160,7 @@ def _write_files(
 ) -> None:
     """Fill a new folder with the files of a checkpoint and bring them to the disk."""
     for group, named in tensors.items():
-        # Cloned because safetensors refuses tensors that share memory, as tied weights and views of a buffer do.
-        apart = {k: v.detach().cpu().clone(memory_format=torch.contiguous_format) for k, v in named.items()}
-        (folder / f"{group}.safetensors").write_bytes(save(apart))
+        (folder / f"{group}{_TENSORS}").write_bytes(save(_apart(named)))
     (folder / "state.json").write_text(json.dumps(state), encoding="utf-8")
     files = {p.name: {"sha256": sha256(p), "bytes": p.stat().st_size} for p in sorted(folder.iterdir())}
     manifest = {"schema_version": SCHEMA_VERSION, "step": step, "files": files}
@@ -158,6 +168,18 @@ def _write_files(
     for file in folder.iterdir():
         fsync_file(file)
     fsync_folder(folder)
+
+
+def _apart(named: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors on the CPU, of which no two share memory: safetensors refuses tied weights and views of one tensor."""
+    apart: dict[str, Tensor] = {}
+    storages = set()
+    for name, tensor in named.items():
+        tensor = tensor.detach().cpu().contiguous()
+        storage = tensor.untyped_storage().data_ptr()
+        apart[name] = tensor.clone() if storage in storages else tensor
+        storages.add(storage)
+    return apart
 
 
 def _checkpoints(folder: Path) -> list[Path]:
@@ -173,9 +195,14 @@ def _step(path: Path) -> int:
     return int(path.name.removeprefix("step_").removesuffix(".old"))
 
 
-def _read(path: Path) -> Checkpoint:
+def _read(path: Path, groups: Container[str] | None) -> Checkpoint:
     """Verify and read one checkpoint, or raise one of `_DAMAGE`."""
-    files = _read_manifest(path)
+    listed = _read_manifest(path)
+    files = {
+        name: entry
+        for name, entry in listed.items()
+        if groups is None or not name.endswith(_TENSORS) or name.removesuffix(_TENSORS) in groups
+    }
     for name, (size, digest) in files.items():
         file = path / name
         if file.parent != path:
@@ -186,8 +213,7 @@ def _read(path: Path) -> Checkpoint:
             raise ValueError(f"the content of {name} has changed since it was written (SHA-256)")
     if "state.json" not in files:
         raise ValueError("manifest.json does not list state.json")
-    groups = [name.removesuffix(".safetensors") for name in files if name.endswith(".safetensors")]
-    tensors = {group: load_file(path / f"{group}.safetensors") for group in groups}
+    tensors = {name.removesuffix(_TENSORS): load_file(path / name) for name in files if name.endswith(_TENSORS)}
     return Checkpoint(path, _step(path), tensors, json.loads((path / "state.json").read_text(encoding="utf-8")))
 
 

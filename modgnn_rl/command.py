@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import functools
 import io
 import json
 import os
@@ -28,6 +29,7 @@ import re
 import sys
 import tempfile
 import textwrap
+import traceback
 import typing
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -39,7 +41,9 @@ from hydra._internal.utils import get_args_parser
 from hydra.conf import HelpConf, HydraConf, JobConf, RunDir, SweepDir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
@@ -50,9 +54,10 @@ from omegaconf.errors import (
 )
 
 from modgnn_rl.errors import InputError
+from modgnn_rl.interruption import Stopped
 from modgnn_rl.settings import check, suggestion
 
-__all__ = ["run_command"]
+__all__ = ["run_command", "settings_given"]
 
 Config = TypeVar("Config")
 
@@ -88,11 +93,13 @@ def run_command(
         config_path: where Hydra looks for the YAML files.
 
     Raises:
-        SystemExit: with code 2 after an error that the user can mend, 130 after Ctrl-C, or the code of ``main``.
+        SystemExit: with code 2 after an error that the user can mend, 130 after Ctrl-C, 143 after SIGTERM, or the code
+            of ``main``. In a multirun a job that fails does not stop the others; the code is then the highest.
     """
     nodes = nodes or {}
     known = [*_dotted(schema), *(f"{k.split('/')[0]}.{key}" for k, node in nodes.items() for key in _dotted(node))]
     codes: list[int] = []
+    failed: list[str] = []
     job_began = False
 
     def job_for(act: Callable[[Config], int | None]) -> Callable[[DictConfig], None]:
@@ -100,10 +107,21 @@ def run_command(
             nonlocal job_began
             job_began = True
             try:
-                codes.append(act(_settings(config, schema, name, known)) or 0)
+                code = act(_settings(config, schema, name, known)) or 0
+                codes.extend([code] if act is main else [])
             except InputError as error:
-                # SystemExit passes through Hydra without the lines that Hydra adds to a failed job.
-                raise SystemExit(_report(str(error))) from error
+                code = _report(str(error))
+                if not (goes_on and act is main):
+                    # SystemExit passes through Hydra without the lines that Hydra adds to a failed job.
+                    raise SystemExit(code) from error
+                codes.append(code)
+                failed.append(_job_name())
+            except Exception:
+                if not (goes_on and act is main):
+                    raise
+                traceback.print_exc()
+                codes.append(1)
+                failed.append(_job_name())
 
         return job
 
@@ -112,6 +130,7 @@ def run_command(
     flags = _flags()
     # All jobs of a multirun are checked before the first begins, unless the user brings a launcher or a sweeper.
     rehearse = flags.multirun and not any(override.startswith("hydra/") for override in flags.overrides)
+    goes_on = flags.multirun  # a job that fails does not stop the others
     # A multirun writes its multirun.yaml whatever the settings say; our run folders hold all that it says.
     with tempfile.TemporaryDirectory(prefix="modgnn_rl-") as scratch:
         _register(main, schema, name, nodes, scratch)
@@ -120,6 +139,8 @@ def run_command(
                 warnings.filterwarnings("error", message="provider=.* is not available")
                 for act in [lambda _: 0, main] if rehearse else [main]:
                     hydra.main(version_base="1.3", config_path=config_path, config_name=name)(job_for(act))()
+        except Stopped as stop:
+            sys.exit(stop.code)
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
             sys.exit(130)
@@ -127,8 +148,22 @@ def run_command(
             if job_began:
                 raise
             sys.exit(_report(_explain(error, known)))
+    if failed:
+        print(f"{len(failed)} of {len(codes)} jobs failed: {'; '.join(failed)}", file=sys.stderr)
     if any(codes):
         sys.exit(max(codes))
+
+
+def settings_given(config: Any) -> dict[str, Any]:
+    """The settings that the command line of the running command names, by their dotted names, as composed."""
+    overrides = OverridesParser.create().parse_overrides(list(HydraConfig.get().overrides.task))
+    keys = [override.key_or_group for override in overrides]
+    return {key: functools.reduce(getattr, key.split("."), config) for key in keys}
+
+
+def _job_name() -> str:
+    """What the command line says of one of several jobs."""
+    return ",".join(HydraConfig.get().overrides.task)
 
 
 def _report(message: str) -> int:

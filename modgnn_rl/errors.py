@@ -1,8 +1,8 @@
-"""The one exception for input that the user can mend."""
+"""The exceptions that the user can do something about."""
 
 from __future__ import annotations
 
-__all__ = ["InputError"]
+__all__ = ["InputError", "NotFinite"]
 
 
 class InputError(ValueError):
@@ -10,4 +10,11 @@ class InputError(ValueError):
 
     Its message is one sentence that says what was wrong, what was expected and what to do. The commands print that
     sentence alone, without a traceback, and exit with code 2; in Python it is raised like any ``ValueError``.
+    """
+
+
+class NotFinite(InputError):
+    """Numbers that have become NaN or infinite while flying or training: a state, an action, a loss, a gradient.
+
+    Its message says whose they are and when, what was found, and which setting helps. No bug, hence an `InputError`.
     """

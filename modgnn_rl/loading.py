@@ -21,12 +21,13 @@ from modgnn_rl.settings import check
 __all__ = ["load_policy", "stored_model", "stored_world"]
 
 
-def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu") -> ModGNN:
+def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", which: str = "last") -> ModGNN:
     """Load the policy that a run ended with, or reached so far.
 
     Args:
         folder: a run folder, ``runs/<date>-<name>``.
         device: where the policy goes.
+        which: ``last``, or ``best``: the one with the best score while it trained.
 
     Returns:
         the policy, a TensorDictModule for flocks of any size, in evaluation mode.
@@ -37,7 +38,7 @@ def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = 
     run = RunFolder.open(Path(folder))
     model = stored_model(run)
     policy = configured_model(model, stored_world(run), seed=0)
-    checkpoint = load_checkpoint(run.checkpoints)
+    checkpoint = load_checkpoint(run.best if which == "best" else run.checkpoints, groups=("policy",))
     try:
         policy.load_state_dict(checkpoint.tensors["policy"])
     except (KeyError, RuntimeError) as error:

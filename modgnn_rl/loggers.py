@@ -1,175 +1,187 @@
-"""Dashboards beside the plain ``metrics.jsonl``: TorchRL's loggers behind a guard that lets training go on."""
+"""The dashboards of a run beside the plain ``metrics.jsonl``, guarded so that training goes on whatever they do."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import importlib.metadata
 import importlib.util
-import os
-import shlex
+import subprocess
+import threading
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from modgnn_rl.configs.schema import LoggerConfig
+import torch
+
+from modgnn_rl.configs.schema import TrainConfig, as_list
+from modgnn_rl.dashboards import CsvFiles, Dashboard, Tensorboard, Wandb, one_line
 from modgnn_rl.errors import InputError
 from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.settings import check
 
-__all__ = ["GuardedLogger", "check_logger", "make_logger"]
+__all__ = ["Dashboards", "check_logger", "made_with", "make_logger"]
+
+PATIENCE = 13.0  # s; a dashboard that takes longer over anything is turned off
 
 
-class GuardedLogger:
-    """A logger whose first exception turns it off with one warning; it never raises.
+class Dashboards:
+    """Dashboards of which each is turned off by its first exception, or its first long wait, with one warning.
+
+    None of the methods raises, and the other dashboards go on.
 
     Args:
-        name: what the warning calls it.
-        build: makes the logger of ``torchrl.record``, or returns None where nothing is to be logged.
+        builders: makes each dashboard, by the name that warnings call it.
+        patience: longest wait for anything, s; default: `PATIENCE`.
     """
 
-    def __init__(self, name: str, build: Callable[[], Any]) -> None:
-        self.name = name
-        self._logger: Any = None
-        self._logger = self._guard(build)
+    def __init__(self, builders: Mapping[str, Callable[[], Dashboard]], *, patience: float | None = None) -> None:
+        self.patience = PATIENCE if patience is None else patience
+        self._dashboards: dict[str, Dashboard] = {}
+        for name, build in builders.items():
+            made = self._guard(name, build)
+            if made is not None:
+                self._dashboards[name] = made
+
+    def __len__(self) -> int:
+        """How many are on."""
+        return len(self._dashboards)
+
+    @property
+    def shows_videos(self) -> bool:
+        """Whether any that is on shows films."""
+        return any(dashboard.shows_videos for dashboard in self._dashboards.values())
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         """Log numbers or tensors of one element at a step."""
-        if self._logger is not None:
-            self._guard(lambda: self._logger.log_metrics(dict(metrics), step=step))
+        self._each(lambda dashboard: dashboard.log(step, metrics))
 
-    def close(self) -> str | None:
-        """Finish the log and return one line for the user that says where it lies, or None where it was off."""
-        if self._logger is None:
-            return None
-        line: str | None = self._guard(lambda: _whereabouts(self.name, self._logger))
-        if line is not None:
-            self._guard(self._logger.close)
-        self._logger = None
-        return line
+    def log_histogram(self, step: int, name: str, values: torch.Tensor) -> None:
+        """Log how the finite numbers of a tensor are distributed."""
+        finite = values.detach()[values.isfinite()].float().cpu().numpy()
+        if finite.size:
+            self._each(lambda dashboard: dashboard.log_histogram(step, name, finite))
 
-    def _guard(self, action: Callable[[], Any]) -> Any:
-        """Return the action's result, or turn this logger off."""
+    def log_video(self, step: int, name: str, path: Path) -> None:
+        """Show a film, an mp4 file."""
+        self._each(lambda dashboard: dashboard.log_video(step, name, path))
+
+    def log_table(self, name: str, columns: Sequence[str], rows: Sequence[Sequence[str | float]]) -> None:
+        """Show a table; later ones of that name replace it."""
+        self._each(lambda dashboard: dashboard.log_table(name, columns, rows))
+
+    def log_references(self, step: int, references: Mapping[str, Mapping[str, float]]) -> None:
+        """Draw horizontal lines up to this step into charts: for each metric, the value of each line by its name."""
+        self._each(lambda dashboard: dashboard.log_references(step, references))
+
+    def close(self) -> list[str]:
+        """Finish all; for each that was still on, one line for the user that says where it lies."""
+        lines = self._each(lambda dashboard: dashboard.close())
+        self._dashboards.clear()
+        return lines
+
+    def _each(self, action: Callable[[Dashboard], Any]) -> list[Any]:
+        """What the action returns for each dashboard that it does not turn off."""
+        on = list(self._dashboards.items())
+        results = [self._guard(name, functools.partial(action, dashboard)) for name, dashboard in on]
+        return [result for result in results if result is not None]
+
+    def _guard(self, name: str, action: Callable[[], Any]) -> Any:
+        """Return the action's result, or turn this dashboard off."""
         try:
-            return action()
+            return _within(self.patience, action)
         except Exception as error:  # whatever a dashboard does, training goes on
-            self._logger = None
-            if self.name == "wandb":
+            self._dashboards.pop(name, None)
+            if name == "wandb":
                 _stop_wandb()
             warnings.warn(
-                f"logger={self.name} failed and is now off ({_one_line(error)}); metrics.jsonl goes on",
+                f"logger={name} failed and is now off ({one_line(error)}); metrics.jsonl goes on",
                 RuntimeWarning,
-                stacklevel=3,
+                stacklevel=5,
             )
             return None
 
 
-def check_logger(config: LoggerConfig) -> None:
-    """Check that a logger can be made, before anything is created.
+def check_logger(config: TrainConfig) -> None:
+    """Check that the dashboards of a run can be made, before anything is created.
 
     Raises:
-        InputError: a setting is out of range, or the logger needs a package that is not installed.
+        InputError: one is named twice, or another beside none, or one needs a package that is not installed.
     """
-    check(config, "logger")
-    if config.name == "tensorboard" and importlib.util.find_spec("tensorboard") is None:
+    names = as_list(config.logger)
+    if len(set(names)) != len(names) or ("none" in names and len(names) > 1):
+        raise InputError(f"logger=[{','.join(names)}] must name each dashboard once, and none only by itself")
+    if "tensorboard" in names and importlib.util.find_spec("tensorboard") is None:
         raise InputError("logger=tensorboard needs a package that is not installed: pip install tensorboard")
 
 
-def make_logger(config: LoggerConfig, run: RunFolder) -> GuardedLogger:
-    """Make the logger that a run asks for, with its files inside the run folder.
+def make_logger(config: TrainConfig, run: RunFolder) -> Dashboards:
+    """Make the dashboards that a run asks for, with their files inside the run folder.
 
-    It asks for no key, waits on no terminal, and gives up on a server after ``config.init_timeout``.
+    They show all settings and what the run was made with from the start on.
 
     Raises:
-        InputError: as :func:`check_logger`.
+        InputError: as `check_logger`.
     """
     check_logger(config)
-    builders: dict[str, Callable[[], Any]] = {
-        "none": lambda: None,
-        "csv": lambda: _make_csv(run),
-        "tensorboard": lambda: _make_tensorboard(run),
-        "wandb": lambda: _make_wandb(config, run),
+    names = [name for name in as_list(config.logger) if name != "none"]
+    about = made_with() if names else {}
+    builders: dict[str, Callable[[], Dashboard]] = {
+        "csv": lambda: CsvFiles(run, about),
+        "tensorboard": lambda: Tensorboard(run, about),
+        "wandb": lambda: Wandb(run, about, config.wandb),
     }
-    return GuardedLogger(config.name, builders[config.name])
+    return Dashboards({name: builders[name] for name in names})
 
 
-def _make_csv(run: RunFolder) -> Any:
-    from torchrl.record import CSVLogger
-
-    return CSVLogger(exp_name="csv", log_dir=str(run.path))
-
-
-def _make_tensorboard(run: RunFolder) -> Any:
-    from torchrl.record import TensorboardLogger
-
-    return TensorboardLogger(exp_name="tensorboard", log_dir=str(run.path))
-
-
-def _make_wandb(config: LoggerConfig, run: RunFolder) -> Any:
-    """Start Weights & Biases as asked for; online falls back to offline."""
-    if config.mode != "online":
-        return _start_wandb(config, run, config.mode)
-    try:
-        return _start_wandb(config, run, "online")
-    except Exception as error:  # no key, no network, no such project: all mean offline
-        warnings.warn(
-            f"Weights & Biases cannot be reached ({_one_line(error)}); this run is logged offline",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-        return _start_wandb(config, run, "offline")
+def made_with() -> dict[str, str]:
+    """Versions of this library and of those that it rests on, and the git commit of its code where there is one."""
+    about = {name: importlib.metadata.version(name) for name in ("modgnn-rl", "torch", "torchrl", "tensordict")}
+    folder = Path(__file__).parent
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        for command in ("ls-files --error-unmatch __init__.py", "describe --always --dirty --abbrev=40 --exclude=*"):
+            answer = subprocess.run(
+                ["git", "-C", str(folder), *command.split()], capture_output=True, text=True, check=True, timeout=5
+            )
+        about["commit"] = answer.stdout.strip()
+    return about
 
 
-def _start_wandb(config: LoggerConfig, run: RunFolder, mode: str) -> Any:
-    """Start a Weights & Biases run in exactly this mode."""
-    # Its error reports, on unless refused, hold back the exit for 20 s where the server does not answer.
-    os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
-    # It keeps a log of its own in the home folder otherwise, and floods the terminal where that is read-only.
-    os.environ.setdefault("WANDB_CACHE_DIR", str(run.path / "wandb" / "cache"))
-    import wandb
-    from torchrl.record import WandbLogger
+def _within(seconds: float, action: Callable[[], Any]) -> Any:
+    """What an action returns or raises, unless it takes longer; then it is left alone.
 
-    wandb.setup(wandb.Settings(silent=True))
-    # Asked before init, which would prompt on a terminal where there is no key.
-    if mode == "online" and not wandb.login(prompt=False, verify=False):
-        raise RuntimeError("no API key; `wandb login` stores one")
-    settings = wandb.Settings(
-        console="off",
-        init_timeout=config.init_timeout,
-        finish_timeout=config.init_timeout,
-        x_save_requirements=False,  # the list of all installed packages is nobody's business
-    )
-    # The mode goes to wandb.init: TorchRL's own `offline=True` would set WANDB_MODE for the whole process.
-    return WandbLogger(
-        exp_name=run.path.name,
-        save_dir=str(run.path),
-        project=config.project,
-        log_env_packages=False,
-        mode=mode,
-        reinit="create_new",
-        config=run.config,
-        settings=settings,
-    )
+    Raises:
+        TimeoutError: it took longer.
+    """
+    outcome: list[tuple[Any, BaseException | None]] = []
+
+    def act() -> None:
+        try:
+            outcome.append((action(), None))
+        except BaseException as error:  # raised again below
+            outcome.append((None, error))
+
+    thread = threading.Thread(target=act, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if not outcome:
+        raise TimeoutError(f"no answer within {seconds:g} s")
+    result, error = outcome[0]
+    if error is not None:
+        raise error
+    return result
 
 
 def _stop_wandb() -> None:
-    """Drop the helper process of Weights & Biases, which may be dead, so that nothing fails again at exit."""
+    """End the helper process of Weights & Biases, be it dead or hanging, so that nothing waits for it at exit."""
     with contextlib.suppress(Exception):
         import wandb
+        from wandb.sdk import wandb_setup
 
-        wandb.teardown()
-
-
-def _whereabouts(name: str, logger: Any) -> str:
-    """Return the line that tells the user where a log lies."""
-    if name != "wandb":
-        return f"{name}: {logger.experiment.log_dir}"
-    settings = logger.experiment.settings
-    if settings.mode == "disabled":
-        return "wandb: disabled, nothing was kept"
-    if settings.mode == "online":
-        return f"wandb: {logger.experiment.url}"
-    return f"wandb: offline run in {settings.sync_dir}; to send it: wandb sync {shlex.quote(settings.sync_dir)}"
-
-
-def _one_line(error: Exception) -> str:
-    """Return the first line of an exception."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
+        helper = wandb_setup.singleton().assert_service()._proc
+        try:
+            _within(1.0, wandb.teardown)
+        finally:
+            if helper is not None:
+                helper._process.kill()
+                helper._process.wait(1.0)

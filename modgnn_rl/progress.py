@@ -29,6 +29,7 @@ class Progress:
         description: what is going on, at the start of the line.
         total: how many units there are to do.
         unit: what is counted; the rate is given in units per second.
+        done: units that were done before, in work that goes on.
         every: smallest time between two plain lines, s.
         stream: where to write; the standard error stream where left out.
         clock: the time in s, for plain lines.
@@ -40,12 +41,13 @@ class Progress:
         total: int,
         *,
         unit: str = "flock-steps",
+        done: int = 0,
         every: float = 10.0,
         stream: TextIO | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.description, self.total, self.unit = description, total, f" {unit}"
-        self.done = 0
+        self.done = self.initial = done
         self.figures: dict[str, str] = {}
         self._stream = sys.stderr if stream is None else stream
         self._every, self._clock = every, clock
@@ -58,6 +60,7 @@ class Progress:
             self._bar = tqdm(
                 desc=self.description,
                 total=self.total,
+                initial=self.initial,
                 unit=self.unit,
                 unit_scale=True,
                 bar_format=_LIVE,
@@ -97,6 +100,7 @@ class Progress:
             self.done,
             self.total,
             self._last - self._start,
+            initial=self.initial,
             prefix=self.description,
             unit=self.unit,
             unit_scale=True,

@@ -6,21 +6,23 @@ import contextlib
 import json
 import math
 import os
+import platform
 import re
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import yaml
+from filelock import FileLock, Timeout
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.files import write_atomically
+from modgnn_rl.files import fsync_file, write_atomically
 
 __all__ = ["SCHEMA_VERSION", "RunFolder"]
 
@@ -35,7 +37,7 @@ _HEADER = (
 class RunFolder:
     """A run folder, made by :meth:`create` or found by :meth:`open`.
 
-    It holds ``config.yaml``, ``metrics.jsonl``, ``checkpoints/`` and whatever :meth:`write` adds.
+    It holds ``config.yaml``, ``metrics.jsonl``, ``status.json``, ``checkpoints/`` and whatever :meth:`write` adds.
 
     Attributes:
         path: the folder.
@@ -66,7 +68,7 @@ class RunFolder:
             missing = [folder for folder in (root, *root.parents) if not folder.exists()]
             root.mkdir(parents=True, exist_ok=True)
             path = _make_unique(root / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{name}")
-            write_atomically(path / "config.yaml", f"{_HEADER}schema_version: {SCHEMA_VERSION}\n{config_yaml}")
+            cls(path, {}).with_config(config_yaml)
         except OSError as error:
             if path is not None:
                 shutil.rmtree(path, ignore_errors=True)
@@ -89,8 +91,7 @@ class RunFolder:
         """
         path = parent.path / name
         path.mkdir(exist_ok=True)
-        write_atomically(path / "config.yaml", f"{_HEADER}schema_version: {SCHEMA_VERSION}\n{config_yaml}")
-        return cls.open(path)
+        return cls(path, {}).with_config(config_yaml)
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> RunFolder:
@@ -108,10 +109,84 @@ class RunFolder:
             )
         return cls(path, _read_config(file))
 
+    def with_config(self, config_yaml: str) -> RunFolder:
+        """Write ``config.yaml``, and return the folder as it is then."""
+        self.write("config.yaml", f"{_HEADER}schema_version: {SCHEMA_VERSION}\n{config_yaml}")
+        return self.open(self.path)
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other processes from training in this folder; the lock ends with the process, however that ends.
+
+        Raises:
+            InputError: another process trains in it.
+        """
+        lock = FileLock(self._lock_file)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise InputError(
+                f"{self.path} is in use by a training run (process {self.status.get('pid', 'unknown')}): wait for it, "
+                "stop it, or begin a run of its own"
+            ) from None
+        except OSError as error:
+            raise InputError(f"cannot write into {self.path} ({error.strerror}): make the folder writable") from error
+        try:
+            yield
+        finally:
+            lock.release()
+
+    @property
+    def is_locked(self) -> bool:
+        """Whether a process trains in this folder now."""
+        try:
+            with FileLock(self._lock_file).acquire(timeout=0) if self._lock_file.exists() else contextlib.nullcontext():
+                return False
+        except Timeout:
+            return True
+        except OSError:  # a folder that this user may only read
+            return False
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """What `note_status` wrote; empty where there is nothing readable."""
+        try:
+            found = json.loads((self.path / "status.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    @property
+    def state(self) -> str:
+        """How the run stands: ``training``, ``evaluating``, ``finished``, ``stopped``, ``failed``, or ``killed``."""
+        state = str(self.status.get("state", "unknown"))
+        return "killed" if state in ("training", "evaluating") and not self.is_locked else state
+
+    def note_status(self, state: str, **figures: float | str) -> None:
+        """Write how the run stands into ``status.json``.
+
+        Args:
+            state: ``training``, ``evaluating``, ``finished``, ``stopped`` (it can be resumed) or ``failed``.
+            figures: what else there is to say; what was said before stays.
+        """
+        now = datetime.now().astimezone().isoformat(timespec="seconds")
+        fresh = {"state": state, "updated": now, "pid": os.getpid(), "host": platform.node()}
+        status = {"started": now, **self.status, **fresh, **figures}
+        self.write("status.json", json.dumps(status, indent=2) + "\n")
+
+    @property
+    def _lock_file(self) -> Path:
+        return self.path / ".lock"
+
     @property
     def checkpoints(self) -> Path:
         """The folder for :func:`modgnn_rl.checkpoint.save_checkpoint`."""
         return self.path / "checkpoints"
+
+    @property
+    def best(self) -> Path:
+        """The folder for the best policy, a checkpoint that holds nothing else."""
+        return self.path / "best"
 
     @property
     def metrics_file(self) -> Path:
@@ -129,11 +204,36 @@ class RunFolder:
         finite = {key: value if math.isfinite(value) else None for key, value in values.items()}
         line = json.dumps({"step": int(step)} | finite, allow_nan=False).encode() + b"\n"
         with self.metrics_file.open("a+b") as file:
-            if file.tell() > 0:
+            size = file.tell()
+            if size > 0:
                 file.seek(-1, os.SEEK_END)
                 if file.read(1) != b"\n":  # a crash cut the last line; do not append to it
                     line = b"\n" + line
-            file.write(line)
+            try:
+                file.write(line)
+                file.flush()
+            except OSError:
+                file.truncate(size)  # no half lines where the disk is full
+                raise
+
+    def sync_metrics(self) -> int:
+        """Bring ``metrics.jsonl`` to the disk and return its size, bytes."""
+        if not self.metrics_file.exists():
+            return 0
+        fsync_file(self.metrics_file)
+        return self.metrics_file.stat().st_size
+
+    def cut_metrics(self, size: int) -> None:
+        """Take back what was appended to ``metrics.jsonl`` beyond a size, bytes.
+
+        Raises:
+            ValueError: it is shorter than that.
+        """
+        found = self.metrics_file.stat().st_size if self.metrics_file.exists() else 0
+        if found < size:
+            raise ValueError(f"metrics.jsonl has {found} bytes instead of {size}")
+        if found > size:
+            os.truncate(self.metrics_file, size)
 
     def read_metrics(self) -> list[dict[str, float]]:
         """Return the lines of ``metrics.jsonl``; ``null`` comes back as NaN, a line cut by a crash is left out."""

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import shlex
+import sys
 
-from modgnn_rl.command import run_command
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, MAPPOConfig, TrainConfig
+from modgnn_rl.command import run_command, settings_given
+from modgnn_rl.configs.schema import TrainConfig
+from modgnn_rl.resuming import TRAINER_SETTINGS, with_stored_trainer
 
 
 def main(config: TrainConfig) -> None:
     """Train a decentralised flocking policy from the Reynolds expert, and compare it with the expert."""
-    from modgnn_rl.training import train
+    from modgnn_rl.training import resume, train
 
-    run = train(config)
+    if config.resume is None:
+        run = train(config)
+    else:
+        run = resume(config.resume, {key: value for key, value in settings_given(config).items() if key != "resume"})
     print(f"Policy, metrics and table are in {run.path}")
     print(f"Next: python -m modgnn_rl.evaluate {shlex.quote(f'run={run.path}')} 'evaluation.num_agents=[8,16,64]'")
 
 
 if __name__ == "__main__":
-    run_command(
-        main,
-        TrainConfig,
-        "train",
-        nodes={"trainer/dagger": DAggerConfig, "trainer/bc": BCConfig, "trainer/mappo": MAPPOConfig},
-    )
+    sys.argv = with_stored_trainer(sys.argv)
+    run_command(main, TrainConfig, "train", nodes={f"trainer/{name}": kind for name, kind in TRAINER_SETTINGS.items()})

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import os
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,12 +17,15 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tensordict.nn import TensorDictModuleBase
 
+from modgnn_rl.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation import evaluate
+from modgnn_rl.interruption import Interruption
 from modgnn_rl.loading import load_policy, stored_world
 from modgnn_rl.loggers import check_logger, make_logger
 from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.resuming import begins_anew, changed_config, differences, stored_config
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.settings import check
 from modgnn_rl.table import as_markdown, read_tables, summarise_flights
@@ -27,9 +33,11 @@ from modgnn_rl.trainers.bc import bc
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.dagger import dagger
 from modgnn_rl.trainers.mappo import mappo
+from modgnn_rl.trainers.session import Session
 from modgnn_rl.trainers.setup import check_training, settle_model
+from modgnn_rl.trainers.watching import Watch, log_evaluation
 
-__all__ = ["TRAINERS", "evaluate_policies", "evaluate_run", "prepare_torch", "train"]
+__all__ = ["TRAINERS", "evaluate_policies", "evaluate_run", "prepare_torch", "resume", "train"]
 
 TRAINERS = {"bc": bc, "dagger": dagger, "mappo": mappo}
 
@@ -38,6 +46,9 @@ def train(
     config: TrainConfig, *, expert: TensorDictModuleBase | None = None, callbacks: Sequence[Callback] = ()
 ) -> RunFolder:
     """Train a policy, evaluate it, and leave everything in a new run folder.
+
+    Ctrl-C and SIGTERM let the round end, write a checkpoint and raise `modgnn_rl.interruption.Stopped`; `resume` goes
+    on from there, or from the last checkpoint before whatever else ended the run.
 
     Args:
         config: all settings.
@@ -48,38 +59,110 @@ def train(
     Raises:
         InputError: a bad setting, or a device or a logger that this machine does not have; nothing is created then.
     """
+    config = _checked(config, expert)
+    name = config.name or f"{config.trainer.name}-{config.model.name}"
+    run = RunFolder.create(config.runs, name, OmegaConf.to_yaml(OmegaConf.structured(config)))
+    with run.lock():
+        print(f"Training in {run.path}", flush=True)
+        return _work(config, run, expert, callbacks)
+
+
+def resume(
+    folder: str | os.PathLike[str],
+    changes: Mapping[str, Any] | None = None,
+    *,
+    expert: TensorDictModuleBase | None = None,
+    callbacks: Sequence[Callback] = (),
+) -> RunFolder:
+    """Go on with a run that was stopped, killed, or ended, from its last checkpoint.
+
+    On the CPU, with one thread and the settings unchanged, it ends with the weights, metrics and data with which it
+    would have ended had it never stopped.
+
+    Args:
+        folder: the run folder.
+        changes: new values of settings by their dotted names, as in ``{"trainer.rounds": 160, "logger": "csv"}``. The
+            model, the trainer and the seed cannot change. In another world, or with another number of agents, flocks
+            begin anew, with no data.
+        expert: as `train` was given it.
+        callbacks: as `train` was given them; they begin with what checkpoints hold of them.
+
+    Raises:
+        InputError: no run, no readable checkpoint, a change that cannot be, or a run that goes on elsewhere.
+    """
+    run = RunFolder.open(folder)
+    old = stored_config(run)
+    config = changed_config(old, changes or {})
+    changed = differences(old, config)
+    config = _checked(config, expert)
+    with run.lock():
+        checkpoint = load_checkpoint(run.checkpoints) if has_checkpoint(run.checkpoints) else None
+        anew = begins_anew(changed)
+        if changed:
+            run = run.with_config(OmegaConf.to_yaml(OmegaConf.structured(config)))
+        where = "its start, for it has no checkpoint yet" if checkpoint is None else f"round {checkpoint.step}"
+        print(f"Resuming {run.path} from {where}", flush=True)
+        if anew and checkpoint is not None:
+            print(f"Flocks begin anew, with no data, because of {', '.join(anew)}", flush=True)
+        return _work(config, run, expert, callbacks, checkpoint, keeps_flocks=not anew)
+
+
+def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainConfig:
+    """The settings of a run, with the model settled, after everything that can be refused has been looked at."""
     check(config)
     prepare_torch(config.device, config.threads)
-    check_logger(config.logger)
+    check_logger(config)
     config = settle_model(config)
     check_training(config)
     if expert is not None and getattr(config.trainer, "dataset", None):
         raise InputError(
             "trainer.dataset holds the labels of Reynolds flocking, not those of your expert; leave one out"
         )
-    name = config.name or f"{config.trainer.name}-{config.model.name}"
-    run = RunFolder.create(config.runs, name, OmegaConf.to_yaml(OmegaConf.structured(config)))
-    print(f"Training in {run.path}", flush=True)
-    logger = make_logger(config.logger, run)
-    try:
-        policies = TRAINERS[config.trainer.name](config, run, logger, expert=expert, callbacks=callbacks)
-        sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
-        tables = evaluate_policies(run, policies, config.env, config.evaluation, sizes, config.device, expert=expert)
-        errors = {
-            f"evaluation/{size}/{row}/error": figures["error"]["mean"]
-            for size, table in tables.items()
-            for row, figures in table.items()
-            if figures["error"] is not None
-        }
-        logger.log(int(run.read_metrics()[-1]["step"]), errors)
-    except KeyboardInterrupt:
-        print(f"Stopped; the policy so far is in {run.path}", file=sys.stderr)
-        raise
-    finally:
-        where = logger.close()
-        if where:
-            print(where)
+    return config
+
+
+def _work(
+    config: TrainConfig,
+    run: RunFolder,
+    expert: TensorDictModuleBase | None,
+    callbacks: Sequence[Callback],
+    checkpoint: Checkpoint | None = None,
+    *,
+    keeps_flocks: bool = True,
+) -> RunFolder:
+    """Train from the beginning or from a checkpoint, then evaluate."""
+    dashboards = make_logger(config, run)
+    watches = [Watch(config, run, dashboards, expert)] if dashboards else []
+    with Interruption().listen() as interruption:
+        session = Session(
+            config, run, dashboards, expert, [*callbacks, *watches], checkpoint, keeps_flocks, interruption
+        )
+        try:
+            policies = TRAINERS[config.trainer.name](session)
+            run.note_status("evaluating")
+            sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
+            world, settings, device = config.env, config.evaluation, config.device
+            tables = evaluate_policies(run, policies, world, settings, sizes, device, expert=expert)
+            log_evaluation(dashboards, tables)
+            run.note_status("finished")
+        except BaseException as error:
+            _note_end(run, error)
+            raise
+        finally:
+            for where in dashboards.close():
+                print(where)
     return run
+
+
+def _note_end(run: RunFolder, error: BaseException) -> None:
+    """Say in the run folder, and where it was asked for on the terminal, that a run has ended before its time."""
+    stopped = isinstance(error, KeyboardInterrupt)
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+    with contextlib.suppress(OSError):
+        run.note_status("stopped" if stopped else "failed", reason=reason)
+    if stopped:
+        resuming = shlex.quote(f"resume={run.path}")
+        print(f"Stopped; to go on: python -m modgnn_rl.train {resuming}", file=sys.stderr, flush=True)
 
 
 def evaluate_policies(
@@ -144,7 +227,7 @@ def evaluate_run(config: EvaluateConfig) -> Path:
     """
     check(config)
     prepare_torch(config.device, config.threads)
-    policy = load_policy(config.run, device=config.device)
+    policy = load_policy(config.run, device=config.device, which=config.checkpoint)
     run = RunFolder.open(config.run)
     changes = {name: value for name, value in vars(config.env).items() if value is not None}
     try:
@@ -152,7 +235,8 @@ def evaluate_run(config: EvaluateConfig) -> Path:
     except OmegaConfBaseException as error:
         raise InputError(f"env.{error.full_key}: {str(error.msg).splitlines()[0]}") from error
     sizes = as_list(config.evaluation.num_agents or world.num_agents)
-    named = ",".join(f"{name}={value}" for name, value in sorted(changes.items()))
+    best = {"checkpoint": "best"} if config.checkpoint == "best" else {}
+    named = ",".join(f"{name}={value}" for name, value in sorted({**changes, **best}.items()))
     evaluate_policies(run, {run.config["model"]["name"]: policy}, world, config.evaluation, sizes, config.device, named)
     return evaluation_file(run, named)
 

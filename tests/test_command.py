@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -14,8 +15,9 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from modgnn_rl.command import run_command
+from modgnn_rl.command import run_command, settings_given
 from modgnn_rl.errors import InputError
+from modgnn_rl.interruption import Stopped
 from modgnn_rl.settings import setting
 
 ROOT = Path(__file__).parent.parent
@@ -200,6 +202,40 @@ def test_ctrl_c_is_one_line(run: Run) -> None:
         raise KeyboardInterrupt
 
     assert run(main=main)[:3] == (130, "", "interrupted\n")
+
+
+def test_a_signal_heeded_is_the_exit_code(run: Run) -> None:
+    def main(config: Toy) -> None:
+        raise Stopped(signal.SIGTERM)
+
+    assert run(main=main)[:3] == (143, "", "")
+
+
+def test_a_job_that_fails_does_not_stop_the_others(run: Run) -> None:
+    began = []
+
+    def main(config: Toy) -> int:
+        began.append(config.seed)
+        if config.seed == 1:
+            raise InputError("no such dataset")
+        if config.seed == 2:
+            raise ZeroDivisionError("a bug")
+        return 0
+
+    outcome = run("--multirun", "seed=0,1,2,3", main=main)
+    assert began == [0, 1, 2, 3]
+    assert outcome.code == 2
+    first, *trace, bug, summary = outcome.err.strip().splitlines()
+    assert first == "error: no such dataset"
+    assert trace[0].startswith("Traceback")
+    assert bug == "ZeroDivisionError: a bug"
+    assert summary == "2 of 4 jobs failed: seed=1; seed=2"
+
+
+def test_settings_given_are_those_of_the_command_line(run: Run) -> None:
+    given = []
+    run("seed=3", "trainer=dagger", "env.comm_range=2", main=lambda config: given.append(settings_given(config)))
+    assert given == [{"seed": 3, "trainer": Dagger(), "env.comm_range": 2}]
 
 
 def test_return_value_of_main_is_the_exit_code(run: Run) -> None:

@@ -2,26 +2,42 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import importlib.metadata
 import importlib.util
+import json
+import math
 import os
 import shlex
 import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+import torch
 
-from modgnn_rl.configs.schema import LoggerConfig
+from modgnn_rl import training
+from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig, WandbConfig
+from modgnn_rl.dashboards import Dashboard
 from modgnn_rl.errors import InputError
-from modgnn_rl.loggers import GuardedLogger, check_logger, make_logger
+from modgnn_rl.loggers import Dashboards, check_logger, made_with, make_logger
 from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.settings import check
+from modgnn_rl.trainers.callbacks import Callback
+
+
+def config(logger, **wandb):
+    """A run that logs to these dashboards."""
+    return TrainConfig(trainer=DAggerConfig(), logger=logger, wandb=WandbConfig(**wandb))
 
 
 @pytest.fixture
 def run(tmp_path):
-    return RunFolder.create(tmp_path, "dagger", "seed: 0\n")
+    return RunFolder.create(tmp_path, "dagger", "trainer:\n  rounds: 7\n")
 
 
 @pytest.fixture
@@ -38,110 +54,190 @@ def clean_wandb(monkeypatch, tmp_path):
     wandb.teardown()
 
 
-class FakeLogger:
-    """Fails in the methods named."""
+class Fake(Dashboard):
+    """Fails, or takes its time, in the methods named."""
 
-    def __init__(self, *broken):
-        self.broken = broken
+    shows_videos = True
+
+    def __init__(self, *broken, error=None, seconds=0.0):
+        self.broken, self.seconds = broken, seconds
+        self.error = error or ConnectionError("the server\nis gone")
         self.calls = []
-        self.experiment = type("Experiment", (), {"log_dir": "somewhere"})
-
-    def log_metrics(self, metrics, step):
-        """Note the call."""
-        self._call("log", (step, metrics))
 
     def close(self):
-        """Note the call."""
-        self._call("close", None)
+        """Say where it lies."""
+        return self._call("close") or "fake: somewhere"
 
-    def _call(self, name, value):
-        self.calls.append((name, value))
+    def _call(self, name, *arguments):
+        self.calls.append((name, *arguments))
         if name in self.broken:
-            raise ConnectionError("the server\nis gone")
+            time.sleep(self.seconds)
+            raise self.error
+
+
+for method in ("log", "log_histogram", "log_video", "log_table", "log_references"):
+    setattr(Fake, method, functools.partialmethod(Fake._call, method))
+
+
+def everything(dashboards):
+    """Call each method once."""
+    dashboards.log(1, {"error": 0.5})
+    dashboards.log_histogram(1, "actions", torch.tensor([0.0, math.nan, 1.0, math.inf]))
+    dashboards.log_video(1, "flight", Path("flight.mp4"))
+    dashboards.log_table("rows", ["who", "error"], [["expert", 0.0]])
+    dashboards.log_references(1, {"error": {"expert": 0.0}})
 
 
 def test_none_does_nothing(run):
     before = sorted(run.path.iterdir())
-    logger = make_logger(LoggerConfig(), run)
-    logger.log(1, {"error": 0.5})
-    assert logger.close() is None
+    for logger in ("none", []):
+        dashboards = make_logger(config(logger), run)
+        assert not dashboards
+        everything(dashboards)
+        assert dashboards.close() == []
     assert sorted(run.path.iterdir()) == before
 
 
 def test_csv_lies_in_the_run_folder(run):
-    logger = make_logger(LoggerConfig(name="csv"), run)
-    logger.log(3, {"train/error": 0.5})
-    logger.log(4, {"train/error": float("nan")})
-    assert logger.close() == f"csv: {run.path}/csv"
+    dashboards = make_logger(config("csv"), run)
+    assert not dashboards.shows_videos
+    everything(dashboards)
+    dashboards.log(3, {"train/error": 0.5})
+    dashboards.log(4, {"train/error": float("nan")})
+    assert dashboards.close() == [f"csv: {run.path}/csv"]
     assert (run.path / "csv/scalars/train/error.csv").read_text() == "3,0.5\n4,nan\n"
+    assert (run.path / "csv/tables/rows.csv").read_text() == "who,error\nexpert,0.0\n"
+    settings = (run.path / "csv/texts/hparams0.txt").read_text().splitlines()
+    assert "trainer.rounds: 7" in settings
+    assert f"made_with.torch: {torch.__version__}" in settings
 
 
-def test_a_working_logger_is_passed_everything():
-    fake = FakeLogger()
-    logger = GuardedLogger("fake", lambda: fake)
-    logger.log(1, {"error": 0.5})
-    assert logger.close() == "fake: somewhere"
-    assert logger.close() is None
-    assert fake.calls == [("log", (1, {"error": 0.5})), ("close", None)]
+def test_tensorboard_holds_everything_and_a_run_for_each_reference(run, tmp_path):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    dashboards = make_logger(config("tensorboard"), run)
+    everything(Dashboards({"tensorboard": lambda: _without_film(dashboards)}))
+    assert dashboards.close() == [f"tensorboard --logdir {run.path}/tensorboard"]
+    (own, expert) = (EventAccumulator(str(run.path / "tensorboard" / name)).Reload() for name in ("", "expert"))
+    assert [(event.step, event.value) for event in own.Scalars("error")] == [(1, 0.5)]
+    assert [(event.step, event.value) for event in expert.Scalars("error")] == [(1, 0.0)]
+    (histogram,) = own.Histograms("actions")
+    assert (histogram.histogram_value.num, histogram.histogram_value.max) == (2, 1)
+    table, settings = (
+        own.Tensors(f"{name}/text_summary")[0].tensor_proto.string_val[0].decode() for name in ("rows", "settings")
+    )
+    assert table == "who|error\n---|---\nexpert|0"
+    assert "trainer.rounds|7\n" in settings
+    assert "made_with.torchrl|" in settings
 
 
-@pytest.mark.parametrize("broken", ["log", "close"])
-def test_the_first_failure_turns_a_logger_off_with_one_warning(broken):
-    fake = FakeLogger(broken)
+def _without_film(dashboards):
+    """The first dashboard, but for films: there is none here to show."""
+    dashboard = next(iter(dashboards._dashboards.values()))
+    dashboard.log_video = lambda *_: None
+    return dashboard
+
+
+def test_what_a_run_was_made_with():
+    about = made_with()
+    assert about["torchrl"] == importlib.metadata.version("torchrl")
+    root = Path(__file__).parents[1]
+    git = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    if git.returncode == 0:
+        assert about["commit"].removesuffix("-dirty") == git.stdout.strip()
+    else:
+        assert "commit" not in about
+
+
+def test_working_dashboards_are_passed_everything():
+    fakes = {"one": Fake(), "other": Fake()}
+    dashboards = Dashboards({name: lambda fake=fake: fake for name, fake in fakes.items()})
+    everything(dashboards)
+    assert dashboards.shows_videos
+    assert dashboards.close() == ["fake: somewhere"] * 2
+    assert dashboards.close() == []
+    for fake in fakes.values():
+        assert fake.calls[0] == ("log", 1, {"error": 0.5})
+        assert fake.calls[1][3].tolist() == [0.0, 1.0]  # what is finite
+        assert fake.calls[-1] == ("close",)
+        assert len(fake.calls) == 6
+
+
+@pytest.mark.parametrize("broken", ["log", "log_histogram", "log_video", "log_table", "log_references", "close"])
+def test_the_first_failure_turns_a_dashboard_off_with_one_warning_and_the_others_go_on(broken):
+    fake, other = Fake(broken), Fake()
 
     def use():
-        logger = GuardedLogger("fake", lambda: fake)
-        for step in range(3):
-            logger.log(step, {"error": 0.5})
-        logger.close()
-        logger.log(4, {"error": 0.5})
-        logger.close()
+        dashboards = Dashboards({"fake": lambda: fake, "other": lambda: other})
+        for _ in range(3):
+            everything(dashboards)
+        assert dashboards.close() == ["fake: somewhere"]
+        everything(dashboards)
 
     with pytest.warns(RuntimeWarning) as caught:
         use()
     assert [str(warning.message) for warning in caught] == [
         "logger=fake failed and is now off (the server); metrics.jsonl goes on"
     ]
-    assert [name for name, _ in fake.calls].count(broken) == 1
+    assert [name for name, *_ in fake.calls].count(broken) == 1
+    assert len(other.calls) == 16
 
 
-def test_a_logger_that_cannot_be_made_is_off_with_one_warning():
+def test_a_dashboard_that_hangs_is_left_alone():
+    fake = Fake("log", seconds=5.0)
+    dashboards = Dashboards({"fake": lambda: fake}, patience=0.1)
+    began = time.monotonic()
+    with pytest.warns(RuntimeWarning, match=r"off \(no answer within 0.1 s\)"):
+        dashboards.log(1, {"error": 0.5})
+    assert time.monotonic() - began < 3
+    assert not dashboards
+
+
+def test_a_dashboard_that_cannot_be_made_is_off_with_one_warning():
     def build():
         raise PermissionError
 
     with pytest.warns(RuntimeWarning, match=r"off \(PermissionError\)") as caught:
-        logger = GuardedLogger("fake", build)
+        dashboards = Dashboards({"fake": build})
     assert len(caught) == 1
-    logger.log(1, {"error": 0.5})
-    assert logger.close() is None
+    everything(dashboards)
+    assert dashboards.close() == []
 
 
 def test_ctrl_c_is_not_swallowed():
-    def interrupt():
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        GuardedLogger("fake", interrupt)
+        everything(Dashboards({"fake": lambda: Fake("log", error=KeyboardInterrupt())}))
 
 
 @pytest.mark.parametrize(
-    ("config", "message"),
+    ("settings", "message"),
     [
-        (LoggerConfig(name="wandv"), "did you mean 'wandb'"),
-        (LoggerConfig(mode="on"), "not one of offline, online, disabled"),
-        (LoggerConfig(init_timeout=100.0), "at most 15"),
+        ({"logger": "wandv"}, "did you mean 'wandb'"),
+        ({"logger": ["csv", "wandv"]}, "did you mean 'wandb'"),
+        ({"logger": None}, "logger=None is not one of none, csv"),
+        ({"logger": ["csv", "csv"]}, r"logger=\[csv,csv\] must name each dashboard once"),
+        ({"logger": ["none", "csv"]}, "none only by itself"),
+        ({"wandb": WandbConfig(mode="on")}, "not one of offline, online, disabled"),
+        ({"wandb": WandbConfig(init_timeout=100.0)}, "at most 12"),
+        ({"video_rounds": -1}, "at least 0"),
     ],
 )
-def test_bad_settings_are_refused(config, message):
+def test_bad_settings_are_refused(settings, message):
+    def refuse():
+        bad = TrainConfig(trainer=DAggerConfig(), **settings)
+        check(bad)
+        check_logger(bad)
+
     with pytest.raises(InputError, match=message):
-        check_logger(config)
+        refuse()
 
 
 def test_a_missing_tensorboard_is_said_before_anything_is_made(run, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     before = sorted(run.path.iterdir())
     with pytest.raises(InputError, match="pip install tensorboard"):
-        make_logger(LoggerConfig(name="tensorboard"), run)
+        make_logger(config(["csv", "tensorboard"]), run)
     assert sorted(run.path.iterdir()) == before
 
 
@@ -154,9 +250,9 @@ def test_wandb_offline_writes_into_the_run_folder_only_and_is_silent(run, monkey
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_MODE", "online")
     for _ in range(2):
-        logger = make_logger(LoggerConfig(name="wandb"), run)
+        logger = make_logger(config("wandb"), run)
         logger.log(1, {"train/error": 0.5})
-        line = logger.close()
+        (line,) = logger.close()
         synced = shlex.split(line.partition("wandb sync ")[2])
         assert wandb_files(run)
         assert list(Path(synced[0]).glob("*.wandb"))
@@ -168,18 +264,18 @@ def test_wandb_offline_writes_into_the_run_folder_only_and_is_silent(run, monkey
 
 @pytest.mark.usefixtures("clean_wandb")
 def test_wandb_disabled_keeps_nothing(run):
-    logger = make_logger(LoggerConfig(name="wandb", mode="disabled"), run)
+    logger = make_logger(config("wandb", mode="disabled"), run)
     logger.log(1, {"train/error": 0.5})
-    assert "disabled" in logger.close()
+    assert "disabled" in logger.close()[0]
     assert wandb_files(run) == []
 
 
 def falls_back_to_offline(run, reason, capfd):
     with pytest.warns(RuntimeWarning, match=reason) as caught:
-        logger = make_logger(LoggerConfig(name="wandb", mode="online", init_timeout=0.5), run)
+        logger = make_logger(config("wandb", mode="online", init_timeout=0.5), run)
     assert len(caught) == 1
     logger.log(1, {"train/error": 0.5})
-    assert "wandb sync" in logger.close()
+    assert "wandb sync" in logger.close()[0]
     assert capfd.readouterr() == ("", "")
     assert list(run.path.glob("wandb/offline-run-*/*.wandb"))
 
@@ -198,25 +294,127 @@ def test_wandb_online_with_a_server_that_never_answers_is_offline(run, monkeypat
         falls_back_to_offline(run, "cannot be reached", capfd)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="finds the helper process through ps")
 @pytest.mark.usefixtures("clean_wandb")
-def test_wandb_killed_is_off_with_one_warning_and_does_not_harm_the_next_run(run):
-    logger = make_logger(LoggerConfig(name="wandb"), run)
+def test_wandb_holds_everything(run, tmp_path):
+    film = tmp_path / "flight.mp4"
+    film.write_bytes(b"a film")
+    for step, error in enumerate((0.5, math.nan, 0.25)):
+        run.log(step, {"error": error})
+    dashboards = make_logger(config("wandb", group="mine"), run)
+    everything(Dashboards({"wandb": lambda: _without_film(dashboards)}))
+    dashboards = make_logger(config("wandb", group="mine"), run)
+    assert dashboards.shows_videos
+    dashboards.log_video(2, "flight", film)
+    dashboards.log_table("rows", ["who", "error"], [["expert", 0.0]])
+    dashboards.log_references(2, {"error": {"expert": 0.0, "zero action": 1.0}})
+    assert len(dashboards.close()) == 1
+    folder = run.path / "wandb" / "latest-run" / "files" / "media"
+    assert [path.read_bytes() for path in folder.rglob("*.mp4")] == [b"a film"]
+    tables = {path.name.partition("_")[0]: json.loads(path.read_text()) for path in folder.rglob("*.table.json")}
+    assert tables["rows"]["data"] == [["expert", 0.0]]
+    assert tables["error"]["data"] == [
+        *([step, "this run", error] for step, error in ((0, 0.5), (2, 0.25))),
+        *([step, "expert", 0.0] for step in (0, 2)),
+        *([step, "zero action", 1.0] for step in (0, 2)),
+    ]
+
+
+def wandb_helpers():
+    """The process ids of its helpers."""
     children = subprocess.run(
         ["ps", "--ppid", str(os.getpid()), "-o", "pid=,comm="], capture_output=True, text=True, check=True
     ).stdout
-    helpers = [int(line.split()[0]) for line in children.splitlines() if "wandb-core" in line]
+    return [int(line.split()[0]) for line in children.splitlines() if "wandb-core" in line]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds the helper process through ps")
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+@pytest.mark.usefixtures("clean_wandb")
+def test_wandb_without_its_helper_is_off_with_one_warning_and_does_not_harm_the_next_run(run, monkeypatch, sent):
+    monkeypatch.setattr("modgnn_rl.loggers.PATIENCE", 1.5)
+    logger = make_logger(config("wandb"), run)
+    helpers = wandb_helpers()
     assert helpers
     for helper in helpers:
-        os.kill(helper, signal.SIGKILL)
+        os.kill(helper, sent)
 
     def use():
         for step in range(20_000):  # the first few may still fit into the pipe to the dead process
+            if not logger:
+                break
             logger.log(step, {"train/error": 0.5})
-        assert logger.close() is None
+        assert logger.close() == []
 
+    began = time.monotonic()
     with pytest.warns(RuntimeWarning, match="logger=wandb failed and is now off") as caught:
         use()
+    assert time.monotonic() - began < 15
     assert len(caught) == 1
-    logger = make_logger(LoggerConfig(name="wandb"), run)
-    assert "wandb sync" in logger.close()
+    assert not set(wandb_helpers()) & set(helpers)
+    logger = make_logger(config("wandb"), run)
+    assert "wandb sync" in logger.close()[0]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds the helper process through ps")
+@pytest.mark.usefixtures("clean_wandb")
+def test_training_goes_on_without_wandb_and_metrics_are_complete(tmp_path, monkeypatch):
+    class Kill(Callback):
+        def on_round(self, index, metrics):
+            for helper in wandb_helpers() if index == 2 else ():
+                os.kill(helper, signal.SIGKILL)
+
+    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+    trainer = DAggerConfig(
+        num_envs=1, batch_size=16, cloning_steps=8, cloning_updates=2, rounds=12, round_steps=4, round_updates=2
+    )
+    whole = TrainConfig(
+        env=FlockingConfig(num_agents=4, max_steps=4),
+        model=ModelConfig(name="pair_force", hidden=8),
+        trainer=trainer,
+        logger=["csv", "wandb"],
+        video_rounds=0,
+        runs=str(tmp_path),
+        threads=1,
+    )
+    with pytest.warns(RuntimeWarning, match="logger=wandb failed and is now off"):
+        run = training.train(whole, callbacks=[Kill()])
+    rounds = [line["step"] for line in run.read_metrics()]
+    assert rounds == list(range(13))
+    with (run.path / "csv/scalars/4/loss.csv").open() as file:
+        assert [int(line.partition(",")[0]) for line in file] == rounds
+
+
+ON_A_TERMINAL = """
+import pathlib, sys, warnings
+from modgnn_rl import training
+from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig, WandbConfig
+from modgnn_rl.loggers import make_logger
+from modgnn_rl.run_folder import RunFolder
+
+assert sys.stdin.isatty() and sys.stdout.isatty()
+run = RunFolder.open(sys.argv[1])
+config = TrainConfig(trainer=DAggerConfig(), logger="wandb", wandb=WandbConfig(mode="online"))
+logger = make_logger(config, run)
+logger.log(1, {"error": 0.5})
+print(*logger.close())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+@pytest.mark.usefixtures("clean_wandb")
+def test_wandb_online_without_a_key_on_a_terminal_asks_nothing(run):
+    import pty
+
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-c", ON_A_TERMINAL, str(run.path)]
+    with subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs) as process:
+        os.close(theirs)
+        shown = b""
+        with contextlib.suppress(OSError):  # the other end is closed
+            while part := os.read(ours, 4096):
+                shown += part
+        assert process.wait(60) == 0, shown.decode()
+    os.close(ours)
+    assert b"no API key" in shown
+    assert b"wandb sync" in shown

@@ -20,7 +20,6 @@ from modgnn_rl.configs.schema import (
     EvaluateConfig,
     EvaluationConfig,
     FlockingConfig,
-    LoggerConfig,
     ModelConfig,
     TrainConfig,
     WorldChanges,
@@ -29,7 +28,6 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.trainers.callbacks import Callback
-from modgnn_rl.trainers.journal import Journal
 from modgnn_rl.training import evaluate_run, prepare_torch, train
 
 SMALL = {"num_envs": 2, "batch_size": 16, "capacity": 400}
@@ -52,7 +50,7 @@ def _dagger(**settings):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> RunFolder:
-    return train(_config(tmp_path_factory.mktemp("runs"), _dagger(), logger=LoggerConfig(name="csv")))
+    return train(_config(tmp_path_factory.mktemp("runs"), _dagger(), logger="csv"))
 
 
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
@@ -72,30 +70,19 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
 
 def test_a_checkpoint_holds_what_a_run_is_made_of(run):
     checkpoint = load_checkpoint(run.checkpoints)
-    assert set(checkpoint.tensors) == {"policy", "trained", "optimizer", "generators"}
+    of_flocks = {
+        f"flocks-{name}.{part}" for name in ("5", "validation-5") for part in ("env", "carried", "mixture", "data")
+    }
+    assert set(checkpoint.tensors) == {"policy", "trained", "optimizer", "generators", *of_flocks}
+    drawn = ("env", "faults", "noise", "mixture", "disturbance", "batches")
     assert set(checkpoint.tensors["generators"]) == {
         "learner",
-        *(f"0.5.{name}" for name in ("env", "faults", "noise", "mixture", "disturbance", "batches")),
+        "validation",
+        *(f"flocks-{name}.{role}" for name in ("5", "validation-5") for role in drawn),
     }
     assert checkpoint.state["config"] == run.config
-    assert checkpoint.state["updates"] == checkpoint.state["averaged"] == checkpoint.step == 10
-
-
-def test_an_interrupted_run_leaves_its_policy(tmp_path, monkeypatch, capsys):
-    noted = []
-
-    def interrupt(journal, step, *arguments, **figures):
-        noted.append(step)
-        if step == 2:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(Journal, "note", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        train(_config(tmp_path, _dagger()))
-    (folder,) = tmp_path.iterdir()
-    assert f"the policy so far is in {folder}" in capsys.readouterr().err
-    assert load_checkpoint(folder / "checkpoints").step == 8
-    load_policy(folder)
+    assert checkpoint.state["updates"] == checkpoint.state["averaged"] == 10
+    assert checkpoint.step == 4  # rounds, the cloning included
 
 
 @pytest.mark.parametrize("agents", [1, 2, 9])

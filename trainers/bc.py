@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -15,95 +15,88 @@ from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
 from modgnn_rl.dataset import FlightDataset
 from modgnn_rl.evaluation import fly
-from modgnn_rl.experts import Reynolds
-from modgnn_rl.loggers import GuardedLogger
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.seeds import derive_seed
-from modgnn_rl.trainers.callbacks import Callback
-from modgnn_rl.trainers.collection import Flocks, flocks_of_all_sizes
+from modgnn_rl.trainers.collection import Flocks, flocks_of_all_sizes, named_flocks, validation_flocks
 from modgnn_rl.trainers.journal import Journal
 from modgnn_rl.trainers.learner import Learner, fit_together, validate_together
+from modgnn_rl.trainers.session import Session
 from modgnn_rl.trainers.setup import DART_PARTS, make_learner, side_by_side
 
 __all__ = ["bc"]
 
-ROUNDS = 40  # parts of the training after each of which the loss is looked at
+ROUNDS = 40  # parts of the training at least, after each of which the loss is looked at
+ROUND_UPDATES = 150  # updates of such a part at most: what a signal may have to wait for
 FLIGHT_ROUNDS = 20  # parts after which the policies fly
 FLIGHT_STEPS = 250  # how long
 
 
-def bc(
-    config: TrainConfig,
-    run: RunFolder,
-    logger: GuardedLogger,
-    *,
-    expert: TensorDictModuleBase | None = None,
-    callbacks: Sequence[Callback] = (),
-) -> dict[str, ModGNN]:
+def bc(session: Session) -> dict[str, ModGNN]:
     """Train policies by behaviour cloning, one or several side by side on the same batches.
 
     The expert's flights come from a dataset, or are flown first. The validation error is taken on flights that are not
     trained on. It says little of how a policy flies: it never meets the states that its own errors lead to.
 
     Args:
-        config: the run's settings, ``config.trainer`` being a `BCConfig`.
-        run: the folder to leave metrics and checkpoints in; with several policies, a run folder of each lies in it.
-        logger: the dashboard.
-        expert: writes ``("agents", "expert_action")``; default: Reynolds flocking.
-        callbacks: people's own code.
+        session: the run, ``session.config.trainer`` being a `BCConfig`; with several policies, a run folder of each
+            lies in the run's.
 
     Returns:
         the trained policies, the moving averages of the weights, by name.
     """
+    config, expert = session.config, session.expert
     settings: BCConfig = config.trainer
     sizes = config.env.sizes
-    rounds = min(ROUNDS, settings.cloning_updates // len(sizes))
-    fitting = settings.cloning_updates // (rounds * len(sizes))
+    each = settings.cloning_updates // len(sizes)
+    rounds = min(each, max(ROUNDS, math.ceil(settings.cloning_updates / ROUND_UPDATES)))
+    fitting = each // rounds
     updates = rounds * fitting * len(sizes)
     members = side_by_side(config)
     by_name = {name: make_learner(member, (updates, updates)) for name, member in members.items()}
     learners, policies = list(by_name.values()), [learner.flown for learner in by_name.values()]
-    expert = expert or Reynolds.for_env(config.env)
     parts = DART_PARTS if settings.dart else 1
     flown: dict[str, Any] = {"steps": max(1, settings.cloning_steps // parts), "stretch": settings.cloning_steps}
-    held_out = dataclasses.replace(settings, num_envs=settings.held_out)
-    unseen_config = dataclasses.replace(config, trainer=held_out, seed=derive_seed(config.seed, "validation"))
-    validation = flocks_of_all_sizes(unseen_config, policies, expert, **flown)
-    training = [] if settings.dataset else flocks_of_all_sizes(config, policies, expert, **flown)
+    held_out = validation_flocks(config, policies, expert, **flown)
+    training = {} if settings.dataset else flocks_of_all_sizes(config, policies, expert, **flown)
     flights_at = [part * rounds // parts for part in range(parts)]
-    noise, loss = settings.noise, 0.0
 
     with (
-        _own_folders(run, members, by_name),
-        Journal(run, logger, by_name, [*training, *validation], updates, settings, callbacks) as journal,
+        _own_folders(session.run, members, by_name),
+        Journal(session, by_name, named_flocks(training, held_out), updates) as journal,
     ):
+        buffers = {size: group.buffer for size, group in training.items()}
         if settings.dataset:
-            buffers = [_share(settings.dataset, settings, validation[0], max(policy.window for policy in policies))]
-        else:
-            for group in validation:
-                for _ in range(parts):
-                    group.keep(group.fly(expert_share=1.0))
-            buffers = [group.buffer for group in training]
-        for index in range(rounds):
-            for group in training * flights_at.count(index):
-                group.disturbance.scale = noise = loss**0.5 if settings.dart and index else settings.noise
-                group.keep(journal.show(index + 1, group.fly(expert_share=1.0)))
-            metrics = {"learning_rate": learners[0].learning_rate, "noise": noise}
-            losses = []
-            for buffer, unseen in zip(buffers, validation, strict=True):
+            buffers = {sizes[0]: _share(settings, held_out[sizes[0]], max(policy.window for policy in policies))}
+        for index in journal.rounds(1, rounds):
+            for size, group in training.items():
+                for _ in range(max(flights_at.count(index - 1), not group.seen)):
+                    learned = settings.dart and index > 1
+                    group.disturbance.scale = journal.memory["validation_loss"] ** 0.5 if learned else settings.noise
+                    group.keep(journal.show(group.fly(expert_share=1.0)))
+                for _ in range(parts if not held_out[size].seen else 0):
+                    held_out[size].keep(held_out[size].fly(expert_share=1.0))
+            metrics = {"learning_rate": learners[0].learning_rate}
+            for group in training.values():
+                metrics["noise"] = group.disturbance.scale
+            losses: dict[str, list[float]] = {name: [] for name in by_name}
+            for size, buffer in buffers.items():
+                unseen = held_out[size].buffer
                 found = {
                     "loss": fit_together(learners, buffer, fitting),
-                    "validation_loss": validate_together(learners, unseen.buffer),
+                    "validation_loss": validate_together(learners, unseen),
                 }
-                losses += found["validation_loss"]
                 for name, values in found.items():
-                    metrics |= _named(by_name, f"{unseen.num_agents}/{name}", values)
-                if (index + 1) % FLIGHT_ROUNDS == 0:
-                    metrics |= _errors_in_flight(config, by_name, unseen.num_agents, expert)
-            loss = sum(losses) / len(losses)
-            if journal.note(index + 1, metrics, fitting * len(sizes), validation_loss=loss):
-                break
+                    metrics |= _named(by_name, f"{size}/{name}", values)
+                for name, value in zip(by_name, found["validation_loss"], strict=True):
+                    losses[name].append(value)
+                metrics[f"{size}/states"] = len(buffer)
+                if index % FLIGHT_ROUNDS == 0:
+                    metrics |= _errors_in_flight(config, by_name, size, expert)
+            metrics["gradient_norm"] = learners[0].gradient_norm
+            scores = {name: sum(values) / len(values) for name, values in losses.items()}
+            metrics["validation_loss"] = journal.memory["validation_loss"] = sum(scores.values()) / len(scores)
+            journal.note(metrics, fitting * len(sizes), scores, validation_loss=metrics["validation_loss"])
 
     return dict(zip(by_name, policies, strict=True))
 
@@ -148,17 +141,18 @@ def _errors_in_flight(
     return _named(by_name, f"{size}/error", [float(flight.error.mean()) for flight in flights])
 
 
-def _share(path: str, settings: BCConfig, unseen: Flocks, window: int) -> ReplayBuffer:
+def _share(settings: BCConfig, unseen: Flocks, window: int) -> ReplayBuffer:
     """Share a dataset's flights: the last ``held_out`` become the data of ``unseen``, the others are returned.
 
     A dataset holds no messages: windows make them anew.
     """
-    dataset = FlightDataset.open(path, verify=False, device=unseen.env.device)  # `check_training` has verified it
+    # `check_training` has verified it.
+    dataset = FlightDataset.open(str(settings.dataset), verify=False, device=unseen.env.device)
     seen = dataset.episodes - settings.held_out
     draws: dict[str, Any] = {
         "length": window,
         "batch_size": settings.batch_size,
         "generator": unseen.buffer._rng,  # checkpoints hold it
     }
-    unseen.buffer = dataset.buffer(episodes=range(seen, dataset.episodes), **draws)
+    unseen.borrow(dataset.buffer(episodes=range(seen, dataset.episodes), **draws))
     return dataset.buffer(episodes=range(seen), **draws)

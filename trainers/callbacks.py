@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from tensordict import TensorDictBase
 
@@ -57,6 +58,13 @@ class Callback:
             policies: what is returned, by name.
         """
 
+    def state(self) -> dict[str, Any]:
+        """What checkpoints hold, as plain JSON values, so that a resumed run goes on exactly; nothing by default."""
+        return {}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state` gave, before `on_start`; nothing where the run had no such callback."""
+
 
 class StopOnPlateau(Callback):
     """Stop when a metric does not fall any more.
@@ -84,3 +92,11 @@ class StopOnPlateau(Callback):
             return False
         before, now = sum(self.seen[-2 * self.rounds : -self.rounds]), sum(self.seen[-self.rounds :])
         return now > (1 - self.gain) * before
+
+    def state(self) -> dict[str, Any]:
+        """What was seen."""
+        return {"seen": self.seen}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """See it again."""
+        self.seen = list(state.get("seen", []))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRobinWriter
@@ -17,6 +19,7 @@ from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.seeds import derive_seed, seeded
 from modgnn_rl.trainers.imitation import are_alike
 from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture, SafetyGate, spread
+from modgnn_rl.trainers.saving import Tensors
 
 __all__ = [
     "FlockCollector",
@@ -24,8 +27,10 @@ __all__ = [
     "as_windows",
     "flocks_of",
     "flocks_of_all_sizes",
+    "named_flocks",
     "reservoir_places",
     "stores_messages",
+    "validation_flocks",
     "window_of",
 ]
 
@@ -83,11 +88,25 @@ class FlockCollector:
     @property
     def generators(self) -> dict[str, torch.Generator]:
         """All that draws at random here, by name."""
-        return {
-            f"{self.num_agents}.env": self.env.generator,
-            f"{self.num_agents}.faults": self.env.faults.generator,
-            f"{self.num_agents}.noise": self.noise,
-        }
+        return {"env": self.env.generator, "faults": self.env.faults.generator, "noise": self.noise}
+
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
+        """What a checkpoint holds of the flights."""
+        # TorchRL has no public name for what it carries from step to step, messages among it; its own numbers of
+        # trajectories need not be the same.
+        carried = self.collector._carrier.exclude("collector").flatten_keys("/")
+        return {"env": self.env.snapshot(), "carried": dict(carried.items())}, {}
+
+    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
+        """Go on from what `state` gave.
+
+        Raises:
+            KeyError, RuntimeError: these are flights of other flocks.
+        """
+        self.env.restore(tensors["env"])
+        carried = self.collector._carrier
+        found = TensorDict(tensors["carried"], carried.batch_size, device=self.env.device).unflatten_keys("/")
+        self.collector._carrier = carried.select("collector").update(found)
 
     def close(self) -> None:
         """End the flights."""
@@ -149,6 +168,7 @@ class Flocks(FlockCollector):
         super().__init__(config, num_envs, num_agents, behaviour, steps=steps, seed=seed, device=device)
         self.mixture.restart()  # the collector has tried the policy out
         self.seen = 0
+        self._owns_data = True
         # Not compilable ones would share their counters between processes, and start one of their own for that.
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(settings.capacity, device=device, compilable=True),
@@ -177,12 +197,41 @@ class Flocks(FlockCollector):
     @property
     def generators(self) -> dict[str, torch.Generator]:
         """All that draws at random here, by name."""
-        drawn = {
+        return {
+            **super().generators,
             "mixture": self.mixture.generator,
             "disturbance": self.disturbance.generator,
             "batches": self.buffer._rng,
         }
-        return {**super().generators, **{f"{self.num_agents}.{name}": value for name, value in drawn.items()}}
+
+    def borrow(self, buffer: ReplayBuffer) -> None:
+        """Use data that somebody else keeps; checkpoints do not hold them."""
+        self.buffer, self._owns_data = buffer, False
+
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
+        """What a checkpoint holds of flights and data."""
+        tensors, values = super().state()
+        tensors["mixture"] = self.mixture.state()
+        values |= {"disturbance": self.disturbance.scale, "seen": self.seen}
+        if self._owns_data and self.settings.checkpoint_data and len(self.buffer):
+            tensors["data"] = dict(self.buffer[:].flatten_keys("/").items())
+            values["writer"] = self.buffer.writer.state_dict()
+        return tensors, values
+
+    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
+        """Go on from what `state` gave; without data where the checkpoint has none.
+
+        Raises:
+            KeyError, RuntimeError: these are flights or data of others.
+        """
+        super().restore(tensors, values)
+        self.mixture.restore(tensors["mixture"])
+        self.disturbance.scale = float(values["disturbance"])
+        if "data" in tensors:
+            rows = len(next(iter(tensors["data"].values())))
+            self.buffer.extend(TensorDict(tensors["data"], [rows, self.window]).unflatten_keys("/"))
+            self.buffer.writer.load_state_dict(values["writer"])
+            self.seen = int(values["seen"])
 
 
 def reservoir_places(
@@ -224,10 +273,10 @@ def flocks_of_all_sizes(
     steps: int,
     stretch: int,
     gate: SafetyGate | None = None,
-) -> list[Flocks]:
-    """The flocks of a training run, one group for each size in ``config.env.num_agents``, of as many agents each."""
-    return [
-        Flocks(
+) -> dict[int, Flocks]:
+    """The flocks of a training run, by their size: all in ``config.env.num_agents``, of as many agents each."""
+    return {
+        size: Flocks(
             config.env,
             config.trainer,
             flocks_of(size, config),
@@ -241,7 +290,29 @@ def flocks_of_all_sizes(
             device=config.device,
         )
         for size in config.env.sizes
-    ]
+    }
+
+
+def validation_flocks(
+    config: TrainConfig,
+    policies: Sequence[ModGNN],
+    expert: TensorDictModuleBase,
+    *,
+    steps: int,
+    stretch: int,
+) -> dict[int, Flocks]:
+    """The ``trainer.held_out`` flocks whose flights are not trained on, by size; see `flocks_of_all_sizes`."""
+    held_out = dataclasses.replace(config.trainer, num_envs=config.trainer.held_out)
+    apart = dataclasses.replace(config, trainer=held_out, seed=derive_seed(config.seed, "validation"))
+    return flocks_of_all_sizes(apart, policies, expert, steps=steps, stretch=stretch)
+
+
+def named_flocks(training: Mapping[int, FlockCollector], validation: Mapping[int, FlockCollector]) -> dict[str, Any]:
+    """All flocks of a run by the names that checkpoints give them."""
+    return {
+        **{str(size): group for size, group in training.items()},
+        **{f"validation-{size}": group for size, group in validation.items()},
+    }
 
 
 def stores_messages(policy: ModGNN) -> bool:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from typing import Any
 
-from tensordict.nn import TensorDictModuleBase
-
-from modgnn_rl.configs.schema import DAggerConfig, TrainConfig
-from modgnn_rl.experts import Reynolds
-from modgnn_rl.loggers import GuardedLogger
+from modgnn_rl.configs.schema import DAggerConfig
 from modgnn_rl.modgnn import ModGNN
-from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.trainers.callbacks import Callback, StopOnPlateau
-from modgnn_rl.trainers.collection import flocks_of_all_sizes
-from modgnn_rl.trainers.journal import Journal, flight_metrics
-from modgnn_rl.trainers.learner import fit_together
+from modgnn_rl.trainers.callbacks import StopOnPlateau
+from modgnn_rl.trainers.collection import flocks_of_all_sizes, named_flocks, validation_flocks
+from modgnn_rl.trainers.journal import Journal
+from modgnn_rl.trainers.learner import fit_together, validate_together
+from modgnn_rl.trainers.measures import flight_metrics
 from modgnn_rl.trainers.mixing import SafetyGate, disagreement, expert_share, spread
+from modgnn_rl.trainers.session import Session
 from modgnn_rl.trainers.setup import make_learner
 
 __all__ = ["dagger"]
@@ -24,14 +22,7 @@ __all__ = ["dagger"]
 GATES = {"disagreement": disagreement, "ensemble": spread}
 
 
-def dagger(
-    config: TrainConfig,
-    run: RunFolder,
-    logger: GuardedLogger,
-    *,
-    expert: TensorDictModuleBase | None = None,
-    callbacks: Sequence[Callback] = (),
-) -> dict[str, ModGNN]:
+def dagger(session: Session) -> dict[str, ModGNN]:
     """Train a policy with DAgger.
 
     The expert flies first and the policy clones it. Then, round by round, mixture and policy go on flying the same
@@ -39,63 +30,62 @@ def dagger(
     goes on over all of it. What flies, and what is returned, is the moving average of the policy's weights.
 
     Args:
-        config: the run's settings, ``config.trainer`` being a `DAggerConfig`.
-        run: the folder to leave metrics and checkpoints in.
-        logger: the dashboard.
-        expert: writes ``("agents", "expert_action")``; default: Reynolds flocking.
-        callbacks: people's own code.
+        session: the run, ``session.config.trainer`` being a `DAggerConfig`.
 
     Returns:
         the trained policy, by the name of its model.
     """
+    config = session.config
     settings: DAggerConfig = config.trainer
     sizes = config.env.sizes
     cloning = settings.cloning_updates // len(sizes)
     fitting = settings.round_updates // len(sizes)
     updates = (cloning + settings.rounds * fitting) * len(sizes)
-    expert = expert or Reynolds.for_env(config.env)
     members = settings.ensemble if settings.gate == "ensemble" else 1
     learners = [make_learner(config, (cloning * len(sizes), updates), member) for member in range(members)]
+    cloning_stretches = math.ceil(settings.cloning_steps / settings.round_steps)
     gate = None if settings.gate == "none" else SafetyGate(GATES[settings.gate], settings.gate_threshold)
-    flocks = flocks_of_all_sizes(
-        config,
-        [learner.flown for learner in learners],
-        expert,
-        steps=settings.round_steps,
-        stretch=settings.stretch,
-        gate=gate,
-    )
-    names = [config.model.name, *(f"ensemble_{member}" for member in range(1, members))]
+    policies, expert = [learner.flown for learner in learners], session.expert
+    flown: dict[str, Any] = {"steps": settings.round_steps, "stretch": settings.stretch}
+    flocks = flocks_of_all_sizes(config, policies, expert, **flown, gate=gate)
+    held_out = validation_flocks(config, policies, expert, **flown)
     if settings.plateau_rounds:
         plateau = StopOnPlateau(settings.plateau_rounds, settings.plateau_gain, after=settings.expert_rounds)
-        callbacks = [*callbacks, plateau]
+        session = dataclasses.replace(session, callbacks=[*session.callbacks, plateau])
 
+    names = [config.model.name, *(f"ensemble_{member}" for member in range(1, members))]
     by_name = dict(zip(names, learners, strict=True))
-    with Journal(run, logger, by_name, flocks, updates, settings, callbacks) as journal:
-        for group in flocks:
-            for _ in range(math.ceil(settings.cloning_steps / settings.round_steps)):
-                group.keep(journal.show(0, group.fly(expert_share=1.0)))
-            loss, *_ = fit_together(learners, group.buffer, cloning)
-            journal.note(0, {f"{group.num_agents}/loss": loss}, cloning, cloned=loss)
-            group.mixture.restart()
-
-        for index in range(settings.rounds):
-            share = expert_share(
-                settings.schedule,
-                index,
-                start=settings.expert_share,
-                decay=settings.share_decay,
-                last_round=settings.expert_rounds,
-            )
-            metrics = {"expert_share": share, "learning_rate": learners[0].learning_rate}
-            for group in flocks:
-                flights = journal.show(index + 1, group.fly(share))
-                group.keep(flights)
+    with Journal(session, by_name, named_flocks(flocks, held_out), updates) as journal:
+        for index in journal.rounds(0, settings.rounds):
+            share = 1.0 if index == 0 else share_of_expert(settings, index - 1)
+            stretches, count = (cloning_stretches, cloning) if index == 0 else (1, fitting)
+            metrics = {"learning_rate": learners[0].learning_rate, "expert_share": share}
+            for size, group in flocks.items():
+                for _ in range(stretches):
+                    flights = journal.show(group.fly(share))
+                    group.keep(flights)
+                    if index == 0:
+                        held_out[size].keep(held_out[size].fly(share))
+                if index == 0:
+                    group.mixture.restart()
                 metrics |= flight_metrics(flights, config.env)
-                metrics[f"{group.num_agents}/loss"], *_ = fit_together(learners, group.buffer, fitting)
+                metrics[f"{size}/loss"], *_ = fit_together(learners, group.buffer, count)
+                metrics[f"{size}/validation_loss"], *_ = validate_together(learners, held_out[size].buffer)
+                metrics[f"{size}/states"] = len(group.buffer)
             metrics["error"] = error = sum(metrics[f"{size}/error"] for size in sizes) / len(sizes)
-            round_ = f"{index + 1}/{settings.rounds}"
-            if journal.note(index + 1, metrics, fitting * len(sizes), round=round_, error=error):
-                break
+            metrics["gradient_norm"] = learners[0].gradient_norm
+            round_ = f"{index}/{settings.rounds}"
+            journal.note(metrics, count * len(sizes), {names[0]: error}, round=round_, error=error)
 
-    return {config.model.name: learners[0].flown}
+    return {names[0]: learners[0].flown}
+
+
+def share_of_expert(settings: DAggerConfig, index: int) -> float:
+    """The expert's share of the flying time in a round, counted from 0 after the cloning."""
+    return expert_share(
+        settings.schedule,
+        index,
+        start=settings.expert_share,
+        decay=settings.share_decay,
+        last_round=settings.expert_rounds,
+    )

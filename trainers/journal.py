@@ -2,88 +2,82 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
+import shlex
 import time
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import Any, Protocol
 
-import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 
 from modgnn_rl.checkpoint import save_checkpoint
-from modgnn_rl.configs.schema import FlockingConfig, TrainerConfig
-from modgnn_rl.envs.rewards import flocking_costs
-from modgnn_rl.loggers import GuardedLogger
-from modgnn_rl.metrics import (
-    action_error,
-    cohesion,
-    is_diverged,
-    is_lost,
-    leader_distance,
-    separation,
-    smallest_distance,
-)
+from modgnn_rl.configs.schema import TrainerConfig
+from modgnn_rl.errors import InputError
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.progress import Progress
-from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.tensors import pair_distances
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.collection import FlockCollector
+from modgnn_rl.trainers.saving import Part, gather, scatter
+from modgnn_rl.trainers.session import Session
 
-__all__ = ["Journal", "Learns", "flight_metrics", "reward_metrics"]
+__all__ = ["Journal", "Learns"]
 
-FRAMES = 4  # steps of a batch of flights at which the geometry is measured
+BEST_ROUNDS = 5  # rounds over which scores are averaged
+SAVING_SHARE = 1 / 70  # of the time goes into checkpoints at most: large data are written less often
 
 
-class Learns(Protocol):
-    """What a checkpoint is made of: a learner."""
+class Learns(Part, Protocol):
+    """What a run is about: a learner."""
 
     updates_done: int
-
-    @property
-    def generators(self) -> dict[str, torch.Generator]:
-        """All that draws at random there, by name."""
 
     @property
     def flown(self) -> ModGNN:
         """The policy so far."""
 
-    def state(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
-        """What a checkpoint holds of the learner: named tensors, and plain values."""
-
 
 class Journal:
-    """Writes a run's metrics to its folder, its dashboard and the terminal, its checkpoints, and calls the callbacks.
+    """Counts the rounds of a run, writes their metrics and checkpoints, and calls the callbacks.
+
+    A run that goes on from a checkpoint begins with all as it was there, once the journal is entered.
 
     Args:
-        run: the run folder.
-        logger: the dashboard.
-        learners: what the checkpoints hold; the first is the one that `modgnn_rl.load_policy` finds.
-        flocks: the flocks flown; their generators are in the checkpoints too, and they are closed at the end.
+        session: the run.
+        learners: by name; the first is the one that `modgnn_rl.load_policy` finds.
+        flocks: the flocks flown, by name; they are closed at the end.
         total: updates, or what else ``unit`` says, of the whole run.
-        settings: name the trainer, and say how often to write a checkpoint.
-        callbacks: people's own code.
         unit: what is counted.
+
+    Attributes:
+        round: rounds that are done.
+        step: number of the round that goes on.
+        memory: plain values that the trainer needs to go on; checkpoints hold them.
     """
 
     def __init__(
         self,
-        run: RunFolder,
-        logger: GuardedLogger,
+        session: Session,
         learners: Mapping[str, Learns],
-        flocks: Sequence[FlockCollector],
+        flocks: Mapping[str, FlockCollector],
         total: int,
-        settings: TrainerConfig,
-        callbacks: Sequence[Callback] = (),
         *,
         unit: str = "updates",
     ) -> None:
-        self.run, self.logger, self.learners, self.flocks = run, logger, learners, flocks
-        self.callbacks = callbacks
-        self.progress = Progress(settings.name, total, unit=unit)
-        self.period = 60 * settings.checkpoint_minutes
-        self.saved = time.monotonic()
+        self.session, self.learners, self.flocks = session, dict(learners), dict(flocks)
+        self.settings: TrainerConfig = session.config.trainer
+        self.run, self.callbacks = session.run, session.callbacks
+        self.memory: dict[str, Any] = {}
+        self.round = self.step = self.count = 0
+        self.total, self.unit = total, unit
+        self._wants_to_stop = False
+        self._unwritten: list[tuple[int, dict[str, float]]] = []
+        self._scores: dict[str, list[float]] = {}
+        self._best: dict[str, float] = {}
+        self._saved = -1  # the round of the last checkpoint
+        self._seconds = self._cost = 0.0
 
     @property
     def policies(self) -> dict[str, ModGNN]:
@@ -91,7 +85,11 @@ class Journal:
         return {name: learner.flown for name, learner in self.learners.items()}
 
     def __enter__(self) -> Journal:
-        """Start the progress bar."""
+        """Go on from the checkpoint, if there is one, and start the progress bar."""
+        self._restore()
+        self._began = self._saved_at = self._noted_at = time.monotonic()
+        self.progress = Progress(self.settings.name, self.total, unit=self.unit, done=self.count)
+        self._note_status("training")
         for callback in self.callbacks:
             callback.on_start(self.policies)
         self.progress.__enter__()
@@ -100,116 +98,184 @@ class Journal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop progress bar and flights; unless something went wrong, write the last checkpoint, after Ctrl-C too."""
+        """Stop progress bar and flights; unless something went wrong, write the last checkpoint."""
         self.progress.__exit__(kind, error, trace)
-        for group in self.flocks:
-            group.close()
-        if kind is None or issubclass(kind, KeyboardInterrupt):
-            self.save()
-        if kind is None:
-            for callback in self.callbacks:
-                callback.on_end(self.policies)
+        try:
+            if kind is None:
+                self._save_best()
+                self._save(last=True)
+                for callback in self.callbacks:
+                    callback.on_end(self.policies)
+        finally:
+            for group in self.flocks.values():
+                group.close()
 
-    def show(self, index: int, flights: TensorDictBase) -> TensorDictBase:
-        """Show flights of a round to the callbacks before they are learned from; returns them."""
-        for callback in self.callbacks:
-            callback.on_flights(index, flights)
-        return flights
-
-    def note(self, step: int, metrics: Mapping[str, float], count: int, **figures: float | str) -> bool:
-        """Record the metrics of a round.
+    def rounds(self, first: int, last: int) -> Iterator[int]:
+        """Numbers of the rounds that are left; between two, checkpoints are written and signals heeded.
 
         Args:
-            step: number of the round.
+            first: number of the first round of the run.
+            last: number of its last.
+
+        Raises:
+            modgnn_rl.interruption.Stopped: after the round in which a signal came, and after its checkpoint.
+        """
+        interruption = self.session.interruption
+        advice = "Stopping after this round, with a checkpoint; once more stops at once, without one."
+        with interruption.deferred(advice):
+            while first + self.round <= last and not self._wants_to_stop:
+                self.step = first + self.round
+                yield self.step
+                self.round += 1
+                if self.round % BEST_ROUNDS == 0:
+                    self._save_best()
+                if interruption.is_asked_for:
+                    self._save(last=True)
+                    self._note_status("stopped")
+                    interruption.check()
+                if self._is_due:
+                    self._save()
+
+    def show(self, flights: TensorDictBase) -> TensorDictBase:
+        """Show flights of this round to the callbacks before they are learned from; returns them."""
+        for callback in self.callbacks:
+            callback.on_flights(self.step, flights)
+        return flights
+
+    def note(
+        self, metrics: Mapping[str, float], count: int, scores: Mapping[str, float], **figures: float | str
+    ) -> None:
+        """Record the metrics of this round.
+
+        Args:
             metrics: its metrics.
             count: how much of the total was done in it.
+            scores: what makes a policy the best so far, the lower the better, by the learner's name.
             figures: what the progress bar shows.
-
-        Returns:
-            whether a callback wants to stop here.
         """
-        self.run.log(step, metrics)
-        self.logger.log(step, metrics)
+        self.count += count
+        for name, score in scores.items():
+            self._scores.setdefault(name, []).extend([score] if math.isfinite(score) else [])
+        self._unwritten.append((self.step, dict(metrics)))
+        self._write_metrics()
+        now = time.monotonic()
+        speed = {"time/round": now - self._noted_at, f"time/{self.unit}_per_second": count / (now - self._noted_at)}
+        self._noted_at = now
+        self.session.dashboards.log(self.step, {**metrics, **speed})
         self.progress.update(count, **figures)
-        if time.monotonic() - self.saved > self.period:
-            self.save()
-        wishes = [callback.on_round(step, metrics) for callback in self.callbacks]  # all are called
-        return any(wishes)
+        wishes = [callback.on_round(self.step, metrics) for callback in self.callbacks]  # all are called
+        self._wants_to_stop = any(wishes)
 
-    def save(self) -> None:
-        """Write a checkpoint."""
-        tensors: dict[str, dict[str, Tensor]] = {}
-        state: dict[str, Any] = {"config": self.run.config, "learners": list(self.learners)}
-        generators: dict[str, torch.Generator] = {}
-        for number, (name, learner) in enumerate(self.learners.items()):
-            of_learner, further = learner.state()
-            prefix = f"{name}." if number else ""
-            tensors |= {f"{prefix}{group}": values for group, values in of_learner.items()}
-            state |= {f"{prefix}{key}": value for key, value in further.items()}
-            generators |= {f"{prefix}{role}": generator for role, generator in learner.generators.items()}
-        for number, group in enumerate(self.flocks):
-            generators |= {f"{number}.{name}": generator for name, generator in group.generators.items()}
-        tensors["generators"] = {name: generator.get_state() for name, generator in generators.items()}
-        step = next(iter(self.learners.values())).updates_done
-        save_checkpoint(self.run.checkpoints, step, tensors, state)
-        self.saved = time.monotonic()
+    def _write_metrics(self, *, last: bool = False) -> None:
+        """Append what is not yet written to ``metrics.jsonl``; where that fails, try again after the next round."""
+        try:
+            while self._unwritten:
+                self.run.log(*self._unwritten[0])
+                self._unwritten.pop(0)
+        except OSError as error:
+            self._complain("metrics.jsonl", error, last=last)
 
+    def _save(self, *, last: bool = False) -> None:
+        """Write a checkpoint of this round, unless there is one; where that fails, try again later."""
+        self._write_metrics(last=last)
+        if self._saved == self.round:
+            return
+        began = time.monotonic()
+        try:
+            tensors, values = gather(self._parts())
+            save_checkpoint(
+                self.run.checkpoints, self.round, tensors, values | self._values(), keep=self.settings.keep_checkpoints
+            )
+            self._saved = self.round
+            self._note_status("training")
+        except OSError as error:
+            self._complain("a checkpoint", error, last=last)
+        self._saved_at = time.monotonic()
+        self._cost = (self._saved_at - began) / SAVING_SHARE
 
-def flight_metrics(flights: TensorDictBase, world: FlockingConfig) -> dict[str, float]:
-    """Metrics of flights that a trainer collected; names begin with the number of agents.
+    @property
+    def _is_due(self) -> bool:
+        """Whether it is time for the next checkpoint."""
+        period = 60 * self.settings.checkpoint_minutes
+        return period == 0 or time.monotonic() - self._saved_at > max(period, self._cost)
 
-    Args:
-        flights: [B, T]; where the expert flew some, with who did under ``expert_flies`` [B, T, 1].
-        world: says when a flock has diverged or is lost.
+    def _save_best(self) -> None:
+        """Write the policies whose mean score in the last rounds is the best so far."""
+        for name, scores in self._scores.items():
+            score = sum(scores) / len(scores) if scores else math.inf
+            scores.clear()
+            if score >= self._best.get(name, math.inf):
+                continue
+            self._best[name] = score
+            folder = self.run.best if len(self._scores) == 1 else self.run.path / name / "best"
+            policy = {"policy": self.learners[name].flown.state_dict()}
+            try:
+                save_checkpoint(folder, self.round, policy, {"score": score}, keep=1)
+            except OSError as error:
+                self._complain("the best policy", error, last=False)
 
-    Returns:
-        the error of the actions where the policy flew (NaN where the expert flew throughout), and at a few steps,
-        whoever flew, the other metrics of `modgnn_rl.metrics`.
-    """
-    agents = flights["agents"]
-    flown, expert_flies = agents["controlled"], flights.get("expert_flies", None)
-    if expert_flies is not None:
-        flown = flown & ~expert_flies
-    error = action_error(agents.get("loc", agents["action"]), agents["expert_action"], flown).nanmean()
-    frames = torch.linspace(0, flights.shape[1] - 1, FRAMES).long()
-    position = flights[world.state_key][:, frames, :, :3]
-    measured = {
-        "error": error,
-        "leader_distance": leader_distance(position).mean(),
-        "cohesion": cohesion(position).mean(),
-        "separation": separation(position).mean(),
-        "smallest_distance": smallest_distance(position).min(),
-        "lost": is_lost(position, world.comm_range).double().mean(),
-        "diverged": is_diverged(position, world.max_distance).double().mean(),
-    }
-    if expert_flies is not None:
-        measured["expert_flew"] = expert_flies.double().mean()
-    return {f"{position.shape[-2]}/{name}": float(value) for name, value in measured.items()}
+    def _parts(self, *, with_flocks: bool = True) -> dict[str, Part]:
+        flocks = {f"flocks-{name}": group for name, group in self.flocks.items()} if with_flocks else {}
+        return {**self.learners, **flocks}
 
+    def _values(self) -> dict[str, Any]:
+        """What a checkpoint holds of the run itself."""
+        return {
+            "config": self.run.config,
+            "learners": list(self.learners),
+            "round": self.round,
+            "count": self.count,
+            "memory": self.memory,
+            "callbacks": {name: callback.state() for name, callback in self._named_callbacks()},
+            "best": self._best,
+            "scores": self._scores,
+            "metrics_bytes": self.run.sync_metrics(),
+            "seconds": self._seconds + time.monotonic() - self._began,
+        }
 
-def reward_metrics(flights: TensorDictBase, world: FlockingConfig) -> dict[str, float]:
-    """Mean reward of a step and of an agent that is flown, and each cost that makes it up, unweighted.
+    def _restore(self) -> None:
+        """Go on from the session's checkpoint, or begin."""
+        checkpoint = self.session.checkpoint
+        if checkpoint is None:
+            self.run.cut_metrics(0)
+            return
+        values = checkpoint.state
+        try:
+            scatter(self._parts(with_flocks=self.session.keeps_flocks), checkpoint)
+            self.round = self._saved = int(values["round"])
+            self.count, self.memory, self._best = int(values["count"]), values["memory"], values["best"]
+            self._scores = values["scores"]
+            self._seconds = float(values["seconds"])
+            for name, callback in self._named_callbacks():
+                callback.restore(values["callbacks"].get(name, {}))
+            self.run.cut_metrics(int(values["metrics_bytes"]))
+        except (KeyError, ValueError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(
+                f"{checkpoint.path} does not fit this run ({reason}): resume with the settings and the version that "
+                "made it, or begin a run with init_from="
+            ) from error
 
-    Args:
-        flights: [B, T].
-        world: its weights.
+    def _named_callbacks(self) -> list[tuple[str, Callback]]:
+        """The callbacks by their kinds, with a number where there are several of a kind."""
+        kinds = [type(callback).__qualname__ for callback in self.callbacks]
+        return [
+            (f"{kind}-{kinds[:index].count(kind)}", callback)
+            for index, (kind, callback) in enumerate(zip(kinds, self.callbacks, strict=True))
+        ]
 
-    Returns:
-        by name; names begin with the number of agents.
-    """
-    state = flights["next", *world.state_key]
-    position, velocity = state.split(3, -1)
-    exists = flights.get(("agents", "mask"), None)
-    costs = flocking_costs(
-        position,
-        velocity,
-        flights["agents", "action"],
-        pair_distances(position.flatten(0, 1)).amin(-1).view(position.shape[:-1]),
-        crowding_distance=world.crowding_distance,
-        collision_distance=world.collision_distance,
-        exists=exists,
-    )
-    flown = flights["agents", "controlled"]
-    measured = {f"cost/{name}": cost[flown].mean() for name, cost in costs.items()}
-    measured["reward"] = flights["next", "agents", "reward"][flown].mean()
-    return {f"{position.shape[-2]}/{name}": float(value) for name, value in measured.items()}
+    def _note_status(self, state: str) -> None:
+        """Write how the run stands; a disk that is full does not stop it."""
+        seconds = self._seconds + time.monotonic() - self._began
+        figures: dict[str, Any] = {"round": self.round, "done": self.count, "total": self.total, "unit": self.unit}
+        with contextlib.suppress(OSError):
+            self.run.note_status(state, **figures, seconds=round(seconds, 1))
+
+    def _complain(self, what: str, error: OSError, *, last: bool) -> None:
+        reason = f"{what} cannot be written into {self.run.path} ({error.strerror or error})"
+        if last:
+            raise InputError(
+                f"{reason}: make room, then go on from the last checkpoint with python -m modgnn_rl.train "
+                f"{shlex.quote(f'resume={self.run.path}')}"
+            ) from error
+        warnings.warn(f"{reason}; training goes on, and tries again later", RuntimeWarning, stacklevel=3)

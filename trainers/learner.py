@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -27,8 +27,10 @@ from modgnn_rl.trainers.imitation import (
     rotate,
     stacked_losses,
 )
+from modgnn_rl.trainers.saving import Tensors
+from modgnn_rl.trainers.stepping import Stepper
 
-__all__ = ["Learner", "cosine_learning_rate", "fit_together", "moments_of", "validate_together"]
+__all__ = ["Learner", "cosine_learning_rate", "fit_together", "moments_of", "restore_moments", "validate_together"]
 
 STACKED_PAIRS = 2048  # up to this many pairs of agents in a batch, several seeds learn faster as one
 
@@ -48,10 +50,12 @@ class Learner:
         self.settings = settings
         self.averaged = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.averaging))
         self.generator = torch.Generator().manual_seed(derive_seed(seed, "learner"))
+        self.validating = torch.Generator().manual_seed(derive_seed(seed, "learner", "validation"))
         self.optimizer = torch.optim.Adam([{"params": list(policy.parameters())}], lr=1.0)
         self.scheduler = LambdaLR(
             self.optimizer, lambda step: cosine_learning_rate(step, settings.learning_rates, updates)
         )
+        self.stepper = Stepper(policy, self.optimizer, settings)
         self.turns = settings.rotate and not is_equivariant(policy)
         self.updates_done = 0
 
@@ -73,52 +77,85 @@ class Learner:
         """The loss of the averaged policy on a batch of held-out data."""
         return validate_together([self], buffer)[0]
 
-    def prepare(self, batch: TensorDictBase, *, turn: bool) -> Tensor:
-        """Rotate and hide in a batch of windows [S, W], in place, and choose the agents that count, bool [S, N]."""
-        settings = self.settings
+    def prepare(self, batch: TensorDictBase, *, turn: bool, validate: bool = False) -> Tensor:
+        """Rotate and hide in a batch of windows [S, W], in place, and choose the agents that count, bool [S, N].
+
+        Args:
+            batch: the windows.
+            turn: whether to rotate.
+            validate: draw at random so that training does not notice.
+        """
+        settings, generator = self.settings, self.validating if validate else self.generator
         if turn:
-            rotations = random_rotations(len(batch), batch["agents", "observation"], self.generator)
+            rotations = random_rotations(len(batch), batch["agents", "observation"], generator)
             vectors: list[NestedKey] = [("agents", "observation"), ("agents", "expert_action")]
             # Messages are kept in the data of such policies only where they are sums of observations.
             vectors += [self.policy.messages_key] if self.policy.messages_key in batch else []
             for key in vectors:
                 batch[key] = rotate(batch[key], rotations)
         if settings.hide_velocity:
-            hide_velocities(batch, settings.hide_velocity, self.generator)
+            hide_velocities(batch, settings.hide_velocity, generator)
         controlled = batch["agents", "controlled"][:, -1]
         # At any size as many links as at 32 agents, so that an update takes as long.
         count = max(1, round(settings.receivers * REFERENCE_SIZE / controlled.shape[-1]))
-        return random_receivers(controlled, count, self.generator)
+        return random_receivers(controlled, count, generator)
 
-    def step(self) -> None:
-        """Take an optimiser step along the gradients that the weights hold."""
-        # The optimiser never steps on a gradient that is not finite.
-        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.settings.max_gradient, error_if_nonfinite=True)
-        self.optimizer.step()
-        self.scheduler.step()
-        self.averaged.update_parameters(self.policy)
+    def step(self, loss: Tensor, batch: TensorDictBase) -> None:
+        """Take an optimiser step along the gradients that the weights hold, those of a loss on a batch."""
         self.updates_done += 1
+        if self.stepper.step(self.updates_done, loss, batch):
+            self.scheduler.step()
+            self.averaged.update_parameters(self.policy)
+
+    @property
+    def gradient_norm(self) -> float:
+        """Norm of the last gradient, before it was clipped."""
+        return self.stepper.gradient_norm
 
     @property
     def generators(self) -> dict[str, torch.Generator]:
         """All that draws at random here, by name."""
-        return {"learner": self.generator}
+        return {"learner": self.generator, "validation": self.validating}
 
-    def state(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
         """What a checkpoint holds of the learner: named tensors, and plain values."""
         tensors = {
             "policy": self.flown.state_dict(),
             "trained": self.policy.state_dict(),
             "optimizer": moments_of(self.optimizer),
         }
-        averaged = int(self.averaged.n_averaged)
-        return tensors, {"updates": self.updates_done, "averaged": averaged, "learning_rate": self.learning_rate}
+        averaged, scheduled = int(self.averaged.n_averaged), self.scheduler.last_epoch
+        return tensors, {"updates": self.updates_done, "averaged": averaged, "scheduled": scheduled}
+
+    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
+        """Go on from what `state` gave; the learning rate is that of the run as it is planned now.
+
+        Raises:
+            KeyError, RuntimeError: it is that of another policy.
+        """
+        self.policy.load_state_dict(tensors["trained"])
+        self.flown.load_state_dict(tensors["policy"])
+        self.averaged.n_averaged.fill_(values["averaged"])
+        restore_moments(self.optimizer, tensors["optimizer"])
+        self.updates_done = int(values["updates"])
+        self.scheduler.last_epoch = int(values["scheduled"])
+        rate = self.optimizer.param_groups[0]["lr"] = self.scheduler.lr_lambdas[0](self.scheduler.last_epoch)
+        self.scheduler._last_lr = [rate]
 
 
 def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """What an optimiser remembers of each parameter, as named tensors."""
     entries = optimizer.state_dict()["state"].items()
     return {f"{index}.{name}": value for index, entry in entries for name, value in entry.items()}
+
+
+def restore_moments(optimizer: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
+    """Let an optimiser remember what `moments_of` gave."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in moments.items():
+        index, _, name = key.partition(".")
+        state.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
 def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int) -> list[float]:
@@ -150,17 +187,17 @@ def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int
             losses = [imitation_loss(policy, batch, receivers) for policy in policies]
             for loss in losses:
                 loss.backward()
-        for learner in learners:
-            learner.step()
+        for learner, loss in zip(learners, losses, strict=True):
+            learner.step(loss, batch)
         records.append(torch.stack([loss.detach() for loss in losses]))
-    return torch.stack(records).mean(0).tolist() if records else [math.nan] * len(learners)
+    return torch.stack(records).nanmean(0).tolist() if records else [math.nan] * len(learners)
 
 
 @torch.no_grad()
 def validate_together(learners: Sequence[Learner], buffer: ReplayBuffer) -> list[float]:
     """The loss of the averaged policy of each learner, on one batch of held-out data."""
     batch = buffer.sample()
-    receivers = learners[0].prepare(batch, turn=any(learner.turns for learner in learners))
+    receivers = learners[0].prepare(batch, turn=any(learner.turns for learner in learners), validate=True)
     return [float(imitation_loss(learner.flown, batch, receivers)) for learner in learners]
 
 

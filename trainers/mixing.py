@@ -6,7 +6,7 @@ every state, and then chooses which action is flown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -81,11 +81,35 @@ class Mixture(TensorDictModuleBase):
         self.in_keys: list[Any] = [action, expert_action]
         self.out_keys: list[Any] = [action, expert_flies]
         self._steps = 0
+        self._restarts = 0
         self._expert_flies: Tensor | None = None
 
     def restart(self) -> None:
         """Toss at the next step."""
         self._expert_flies = None
+        self._restarts += 1
+
+    def state(self) -> dict[str, Tensor]:
+        """Who flies now and for how long already, as named tensors."""
+        flies = {} if self._expert_flies is None else {"expert_flies": self._expert_flies}
+        return {"steps": torch.tensor(self._steps), **flies}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what `state` gave; the generator is the caller's."""
+        flies = state.get("expert_flies")
+        self._steps = int(state["steps"])
+        self._expert_flies = None if flies is None else flies.to(self.generator.device)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a copy in another process must hear of, as a part of the module's state."""
+        return {"share": self.share, "restarts": self._restarts}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Take over share and restarts."""
+        self.share = state["share"]
+        if state["restarts"] != self._restarts:
+            self.restart()
+            self._restarts = state["restarts"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Choose the action of each flock."""
@@ -172,6 +196,14 @@ class Disturbance(TensorDictModuleBase):
         self.in_keys: list[Any] = [action]
         self.out_keys: list[Any] = [action]
 
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a copy in another process must hear of, as a part of the module's state."""
+        return {"scale": self.scale}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Take over the scale."""
+        self.scale = state["scale"]
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Disturb the action."""
         action = tensordict[self.in_keys[0]]
@@ -219,6 +251,15 @@ class Ensemble(TensorDictModuleBase):
         stacked = torch.stack(actions)
         distance = (stacked - stacked.mean(0)).square().sum(-1).mean(0).sqrt()
         return tensordict.set(self.out_keys[-1], distance)
+
+    def get_extra_state(self) -> list[dict[str, Tensor]]:
+        """The weights of the other members, as a part of the module's state."""
+        return [member.state_dict() for member in self._others]
+
+    def set_extra_state(self, state: list[dict[str, Tensor]]) -> None:
+        """Take over the weights of the other members."""
+        for member, weights in zip(self._others, state, strict=True):
+            member.load_state_dict(weights)
 
     def make_tensordict_primer(self) -> AgentCache:
         """The transform that gives an environment the other members' messages; the first brings its own."""

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
 from torchrl.modules import PopArtValueNorm, set_recurrent_mode
@@ -20,7 +20,9 @@ from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.collection import as_windows
 from modgnn_rl.trainers.critic import FlockCritic
 from modgnn_rl.trainers.imitation import random_receivers
-from modgnn_rl.trainers.learner import moments_of
+from modgnn_rl.trainers.learner import moments_of, restore_moments
+from modgnn_rl.trainers.saving import Tensors
+from modgnn_rl.trainers.stepping import Stepper
 
 __all__ = ["AnchoredMAPPOLoss", "Improver", "improvement_window"]
 
@@ -124,6 +126,7 @@ class Improver:
             {"params": list(self.critic.parameters()), "lr": settings.critic_learning_rate},
         ]
         self.optimizer = torch.optim.Adam(groups)
+        self.stepper = Stepper(nn.ModuleDict({"actor": self.actor, "critic": self.critic}), self.optimizer, settings)
         self.burn_in, self.window = improvement_window(policy, settings)
         self.updates_done = 0
 
@@ -192,7 +195,8 @@ class Improver:
             for batch in buffer:
                 records.append(self._update(batch, only_critic))
         names = records[0]
-        return {name: float(torch.stack([record[name] for record in records]).mean()) for name in names}
+        means = {name: float(torch.stack([record[name] for record in records]).nanmean()) for name in names}
+        return {**means, "gradient_norm": self.stepper.gradient_norm}
 
     def _update(self, batch: TensorDictBase, only_critic: bool) -> dict[str, Tensor]:
         """One optimiser step on windows [S, W]."""
@@ -209,16 +213,13 @@ class Improver:
         loss = losses["loss_critic"] if only_critic else actor + losses["loss_critic"]
         self.optimizer.zero_grad()
         loss.backward()
-        for group in self.optimizer.param_groups:
-            torch.nn.utils.clip_grad_norm_(group["params"], settings.max_gradient, error_if_nonfinite=True)
-        self.optimizer.step()
         self.updates_done += 1
-        if not only_critic:
+        if self.stepper.step(self.updates_done, loss, batch) and not only_critic:
             self.averaged.update_parameters(self.policy)
         names = ("loss_objective", "loss_critic", "loss_anchor", "clip_fraction", "kl_approx", "entropy")
         return {name: losses[name].detach().mean() for name in names if name in losses}
 
-    def state(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
         """What a checkpoint holds: named tensors, and plain values."""
         tensors = {
             "policy": self.flown.state_dict(),
@@ -229,3 +230,22 @@ class Improver:
             "optimizer": moments_of(self.optimizer),
         }
         return tensors, {"updates": self.updates_done, "averaged": int(self.averaged.n_averaged)}
+
+    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
+        """Go on from what `state` gave.
+
+        Raises:
+            KeyError, RuntimeError: it is that of another policy or another critic.
+        """
+        parts = {
+            "policy": self.flown,
+            "actor": self.actor,
+            "critic": self.critic,
+            "value_norm": self.loss.value_norm,
+            "anchor": self.anchor,
+        }
+        for name, module in parts.items():
+            module.load_state_dict(tensors[name])
+        self.averaged.n_averaged.fill_(values["averaged"])
+        restore_moments(self.optimizer, tensors["optimizer"])
+        self.updates_done = int(values["updates"])

@@ -334,15 +334,6 @@ def test_a_diverged_flock_is_terminated_and_only_it_restarts() -> None:
     assert env.step_count.flatten().tolist() == [1, 0, 1]
 
 
-def test_a_flock_that_is_not_finite_is_terminated() -> None:
-    env = FlockingEnv(2, 3, seed=0)
-    td = env.reset()
-    place(env, 0, line(0.0, NAN, 1.0))
-    td = act(env, td)
-    assert td["next", "terminated"].flatten().tolist() == [True, False]
-    assert td["next", "agents", "observation"][1].isfinite().all()
-
-
 def test_a_flock_is_terminated_when_too_many_agents_touch() -> None:
     """Of four agents two touching are the share of one half that is allowed; three are more."""
     env = FlockingEnv(4, 4, leader_noise=0.0, collision_distance=0.08, max_colliding=0.5)

@@ -84,5 +84,5 @@ def test_learned_messages_are_kept_as_windows_without_the_stale_ones():
 def test_sizes_share_the_agents():
     config = TrainConfig(env=FlockingConfig(num_agents=[4, 8, 32]), trainer=DAggerConfig(num_envs=6))
     flocks = flocks_of_all_sizes(config, [make_model("gcn", seed=0)], Reynolds(), steps=2, stretch=2)
-    shapes = [group.fly(0.0)["adjacency"].shape for group in flocks]
+    shapes = [group.fly(0.0)["adjacency"].shape for group in flocks.values()]
     assert shapes == [(16, 2, 4, 4), (8, 2, 8, 8), (2, 2, 32, 32)]

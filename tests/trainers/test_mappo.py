@@ -91,11 +91,13 @@ def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, m
 def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
     run = train(_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15)))
     checkpoint = load_checkpoint(run.checkpoints)
-    assert set(checkpoint.tensors) == {"policy", "actor", "critic", "value_norm", "anchor", "optimizer", "generators"}
-    drawn = {"env", "faults", "noise"}
-    names = {f"{number}.{size}.{name}" for number, size in enumerate((3, 5)) for name in drawn}
+    of_learner = {"policy", "actor", "critic", "value_norm", "anchor", "optimizer", "generators"}
+    of_flocks = {f"flocks-{size}.{part}" for size in (3, 5) for part in ("env", "carried")}
+    assert set(checkpoint.tensors) == of_learner | of_flocks
+    names = {f"flocks-{size}.{name}" for size in (3, 5) for name in ("env", "faults", "noise")}
     assert set(checkpoint.tensors["generators"]) == {"receivers", "order", *names}
-    assert checkpoint.step == checkpoint.state["updates"] == 3 * 2 * 4  # rounds, sizes, updates
+    assert checkpoint.step == 3
+    assert checkpoint.state["updates"] == 3 * 2 * 4  # rounds, sizes, updates
     assert checkpoint.state["averaged"] == 2 * 2 * 4  # but for the critic's first round
     assert checkpoint.state["config"] == run.config
     weights = load_policy(run.path).state_dict()

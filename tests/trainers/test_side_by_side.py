@@ -159,9 +159,9 @@ def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path
 
     monkeypatch.setattr(Disturbance, "forward", watched)
     metrics = train(_config(tmp_path, dart=True, noise=0.1, cloning_updates=40)).read_metrics()
-    # Tried out and flown for validation without noise; each part with the error of the round before it.
+    # Tried out, and flown for validation, without noise; each part with the error of the round before it.
     after = [metrics[index]["4/validation_loss"] ** 0.5 for index in (9, 19, 29)]
-    assert flown == pytest.approx([0.0, 0.1, *after])
+    assert flown == pytest.approx([0.0, 0.1, 0.0, *after])
     # The metric is the noise in the data of that part.
     expected = [noise for noise in (0.1, *after) for _ in range(10)]
     assert [line["noise"] for line in metrics] == pytest.approx(expected)

@@ -1,0 +1,218 @@
+"""Runs that are killed, on disks that are full, and files that are damaged: `pytest -m slow tests/test_survival.py`."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from modgnn_rl import training
+from modgnn_rl.checkpoint import load_checkpoint, save_checkpoint
+from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, TrainConfig
+from modgnn_rl.errors import InputError
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.training import resume, train
+
+SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}
+TRAINERS = {
+    "bc": BCConfig(**SMALL, cloning_steps=24, cloning_updates=30),
+    "dagger": DAggerConfig(
+        **SMALL, cloning_steps=12, cloning_updates=6, rounds=20, round_steps=12, round_updates=2, expert_rounds=3
+    ),
+    "mappo": MAPPOConfig(
+        num_envs=1, iterations=20, round_steps=8, critic_warmup=1, epochs=1, batches=2, checkpoint_minutes=0
+    ),
+}
+MOMENTS = 20
+FILE_CALLS = {"open", "write", "close", "mkdir", "fsync", "replace", "rename", "rmdir", "unlink", "scandir", "lstat"}
+
+
+@pytest.fixture(autouse=True)
+def _without_evaluation(monkeypatch):
+    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+
+
+def _config(runs: Path, trainer: str) -> TrainConfig:
+    world = FlockingConfig(num_agents=4, max_steps=15)
+    return TrainConfig(env=world, trainer=TRAINERS[trainer], runs=str(runs), threads=1)
+
+
+def _start(function, *arguments):
+    """Call a function in a process of its own, without a word."""
+
+    def work():
+        silence = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(silence, 1)
+        os.dup2(silence, 2)
+        function(*arguments)
+
+    process = multiprocessing.get_context("fork").Process(target=work)
+    process.start()
+    return process
+
+
+def _contents(run: RunFolder):
+    found = load_checkpoint(run.checkpoints)
+    return found.tensors, run.metrics_file.read_bytes()
+
+
+def _assert_equal(one, other):
+    assert one[1] == other[1]
+    for group, named in one[0].items():
+        for name, value in named.items():
+            torch.testing.assert_close(
+                other[0][group][name], value, rtol=0, atol=0, equal_nan=True, msg=f"{group} {name}"
+            )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_killed_at_random_moments(tmp_path, trainer):
+    began = time.monotonic()
+    straight = train(_config(tmp_path / "straight", trainer))
+    duration = time.monotonic() - began
+    moments = random.Random(0)
+    for number in range(MOMENTS):
+        runs = tmp_path / str(number)
+        process = _start(train, _config(runs, trainer))
+        time.sleep(moments.uniform(0.0, duration))
+        process.kill()
+        process.join()
+        if not runs.exists():  # it had not begun
+            continue
+        (folder,) = runs.iterdir()
+        if not (folder / "config.yaml").exists():
+            continue
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # no checkpoint may be damaged
+            run = resume(folder)
+        _assert_equal(_contents(straight), _contents(run))
+        assert run.state == "finished"
+
+
+@pytest.mark.slow
+def test_killed_at_every_call_that_touches_a_file_while_a_checkpoint_is_written(tmp_path):
+    tensors = {"policy": {"weight": torch.arange(6.0)}, "data": {"rows": torch.zeros(1000, 10)}}
+
+    def save_and_die(folder, alive_for):
+        calls = 0
+
+        def die(frame, event, function):
+            nonlocal calls
+            if event == "c_call" and function.__name__ in FILE_CALLS:
+                calls += 1
+                if calls > alive_for:
+                    os.kill(os.getpid(), signal.SIGKILL)
+
+        sys.setprofile(die)
+        save_checkpoint(folder, 3, tensors, {}, keep=2)
+
+    alive_for, ended = 0, -signal.SIGKILL
+    while ended == -signal.SIGKILL:
+        folder = tmp_path / str(alive_for)
+        for step in (1, 2):
+            save_checkpoint(folder, step, tensors, {"step": step}, keep=2)
+        process = _start(save_and_die, folder, alive_for)
+        process.join()
+        ended = process.exitcode
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert load_checkpoint(folder).step in (2, 3)
+        alive_for += 1
+    assert ended == 0
+    assert alive_for > 20
+    print(f"killed at {alive_for - 1} calls")
+
+
+def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path):
+    def train_on_a_small_disk():
+        warnings.simplefilter("default")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # of a file; the checkpoints are larger
+        train(_config(tmp_path / "runs", "dagger"))
+
+    process = _start(train_on_a_small_disk)
+    process.join()
+    (folder,) = (tmp_path / "runs").iterdir()
+    run = RunFolder.open(folder)
+    assert process.exitcode == 1
+    assert run.state == "failed"
+    assert "File too large" in run.status["reason"]
+    assert "make room" in run.status["reason"]
+    assert len(run.read_metrics()) == 21  # it went on to the end
+    assert [path.name for path in run.checkpoints.iterdir()] == []
+    resume(folder)
+    straight = train(_config(tmp_path / "straight", "dagger"))
+    _assert_equal(_contents(straight), _contents(run))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+        return train(_config(tmp_path_factory.mktemp("finished"), "dagger"))
+
+
+def _damage(path: Path, how: str) -> None:
+    content = bytearray(path.read_bytes())
+    if how == "cut":
+        path.write_bytes(content[: len(content) // 2])
+    else:
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+
+
+@pytest.mark.parametrize("how", [pytest.param("cut", marks=pytest.mark.slow), "one bit flipped"])
+def test_a_damaged_checkpoint_is_passed_over(tmp_path, finished, how):
+    straight = _contents(finished)
+    newest = max(finished.checkpoints.iterdir())
+    for file in sorted(newest.iterdir()):
+        folder = tmp_path / file.name
+        shutil.copytree(finished.path, folder)
+        _damage(folder / "checkpoints" / newest.name / file.name, how)
+        with pytest.warns(RuntimeWarning, match="CHECKPOINT PASSED OVER"):
+            assert load_checkpoint(folder / "checkpoints").step == 20
+    with pytest.warns(RuntimeWarning, match="CHECKPOINT PASSED OVER"):
+        run = resume(folder)
+    _assert_equal(straight, _contents(run))
+    for file in run.checkpoints.glob("*/policy.safetensors"):
+        _damage(file, how)
+    with pytest.warns(RuntimeWarning), pytest.raises(InputError, match="restore it from a copy or train again"):
+        resume(folder)
+
+
+def test_two_runs_in_one_folder(finished):
+    with finished.lock():
+        assert finished.is_locked
+        process = multiprocessing.get_context("fork").Process(target=_refused, args=(finished.path,))
+        process.start()
+        process.join()
+    assert process.exitcode == 0
+    assert not finished.is_locked
+
+
+def _refused(folder):
+    with pytest.raises(InputError, match="in use by a training run"):
+        resume(folder)
+
+
+def test_a_killed_run_shows_as_killed(tmp_path, finished):
+    folder = tmp_path / "run"
+    shutil.copytree(finished.path, folder)
+    status = json.loads((folder / "status.json").read_text())
+    (folder / "status.json").write_text(json.dumps({**status, "state": "training"}))
+    run = RunFolder.open(folder)
+    assert run.state == "killed"
+    with run.lock():
+        assert run.state == "training"

@@ -1,0 +1,122 @@
+"""A run that was stopped, or killed, and goes on ends as if nothing had happened."""
+
+from __future__ import annotations
+
+import os
+import signal
+from typing import Any
+
+import pytest
+import torch
+
+from modgnn_rl import training
+from modgnn_rl.checkpoint import load_checkpoint
+from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
+from modgnn_rl.interruption import Stopped
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.training import resume, train
+
+SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}
+MAPPO: Any = {"num_envs": 2, "iterations": 5, "round_steps": 14, "critic_warmup": 1, "epochs": 1, "batches": 2}
+DAGGER: Any = {**SMALL, "cloning_steps": 12, "cloning_updates": 6, "rounds": 4, "round_steps": 12, "round_updates": 4}
+BC: Any = {**SMALL, "cloning_steps": 24, "cloning_updates": 6}
+RUNS: dict[str, dict[str, Any]] = {
+    "bc": {"trainer": BCConfig(**BC)},
+    "bc of several, with noise from the error": {
+        "trainer": BCConfig(**BC, dart=True, models=["gcn", "modgnn_mlp"], seeds=2)
+    },
+    "dagger": {"trainer": DAggerConfig(**DAGGER, expert_rounds=3)},
+    "dagger with a reservoir, stored messages, a plateau": {
+        "trainer": DAggerConfig(**{**DAGGER, "capacity": 40}, replacement="reservoir", plateau_rounds=1),
+        "model": ModelConfig(name="pair_force", hidden=8),
+    },
+    "dagger with an ensemble": {"trainer": DAggerConfig(**DAGGER, gate="ensemble", ensemble=2, gate_threshold=0.1)},
+    "dagger of two sizes in bad weather": {
+        "trainer": DAggerConfig(**DAGGER),
+        "env": FlockingConfig(
+            num_agents=[3, 5],
+            max_steps=15,
+            delay=2,
+            position_noise=0.01,
+            message_loss=0.1,
+            dropout_rate=0.3,
+            wind=0.2,
+            range_spread=0.2,
+            motor_lag=0.02,
+            leader="waypoints",
+        ),
+    },
+    "mappo": {"trainer": MAPPOConfig(**MAPPO, checkpoint_minutes=0, critic_hidden=8)},
+    "mappo with learned messages": {
+        "trainer": MAPPOConfig(**MAPPO, checkpoint_minutes=0, critic_hidden=8, window=3),
+        "model": ModelConfig(name="modgnn_mlp", layers=2, hidden=8),
+    },
+}
+
+
+@pytest.fixture(autouse=True)
+def _without_evaluation(monkeypatch):
+    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+
+
+class Signal(Callback):
+    """Sends a signal to this process in one round."""
+
+    def __init__(self, at, number=signal.SIGTERM):
+        self.at, self.number = at, number
+
+    def on_flights(self, index, flights):
+        """Send it."""
+        if index == self.at:
+            self.at = None
+            os.kill(os.getpid(), self.number)
+
+
+def _config(runs, **settings) -> TrainConfig:
+    settings = {"env": FlockingConfig(num_agents=4, max_steps=15), **settings}
+    return TrainConfig(**settings, runs=str(runs), threads=1)
+
+
+def _stop(runs, at=2, number=signal.SIGTERM, **settings):
+    """A run that was stopped in a round."""
+    with pytest.raises(Stopped) as stopped:
+        train(_config(runs, **settings), callbacks=[Signal(at, number)])
+    assert stopped.value.code == 128 + number
+    (folder,) = runs.iterdir()
+    return RunFolder.open(folder)
+
+
+def _all_of(run):
+    """All that a run ended with."""
+    found = load_checkpoint(run.checkpoints)
+    times = {"seconds", "config"}
+    return found.tensors, {k: v for k, v in found.state.items() if k not in times}, run.metrics_file.read_bytes()
+
+
+def _assert_equal(one, other):
+    for tensors in (one[0], other[0]):
+        assert {name.rpartition(".")[2] for name in tensors} & {"policy", "data"}
+    assert {group: set(named) for group, named in one[0].items()} == {g: set(named) for g, named in other[0].items()}
+    for group, named in one[0].items():
+        for name, value in named.items():
+            torch.testing.assert_close(
+                value, other[0][group][name], rtol=0, atol=0, equal_nan=True, msg=f"{group} {name}"
+            )
+    assert one[1:] == other[1:]
+
+
+QUICK = {"bc of several, with noise from the error", "dagger with a reservoir, stored messages, a plateau", "mappo"}
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in RUNS]
+)
+def test_a_stopped_run_ends_as_one_that_was_not(tmp_path, name):
+    settings = RUNS[name]
+    straight = train(_config(tmp_path / "straight", **settings))
+    run = _stop(tmp_path / "stopped", at=1 if name.startswith("bc") else 2, **settings)
+    assert run.state == "stopped"
+    resume(run.path)
+    assert run.state == "finished"
+    _assert_equal(_all_of(straight), _all_of(run))

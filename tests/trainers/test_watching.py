@@ -1,0 +1,227 @@
+"""What dashboards show of a training beyond metrics, and that the training does not change for it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from modgnn_rl import load_policy, training, videos
+from modgnn_rl.configs.schema import (
+    BCConfig,
+    DAggerConfig,
+    FlockingConfig,
+    MAPPOConfig,
+    ModelConfig,
+    TrainConfig,
+)
+from modgnn_rl.dashboards import Dashboard
+from modgnn_rl.evaluation import fly, reference_policies
+from modgnn_rl.loggers import Dashboards
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.trainers import watching
+from modgnn_rl.trainers.watching import Watch, log_evaluation
+from modgnn_rl.training import train
+
+TRAINERS = {
+    "bc": BCConfig(num_envs=1, batch_size=16, cloning_steps=8, cloning_updates=4, held_out=2),
+    "dagger": DAggerConfig(
+        num_envs=1, batch_size=16, cloning_steps=8, cloning_updates=2, rounds=3, round_steps=4, round_updates=2
+    ),
+    "mappo": MAPPOConfig(
+        num_envs=1, iterations=3, round_steps=4, critic_warmup=0, epochs=1, batches=1, critic_hidden=8
+    ),
+}
+
+
+class Recorder(Dashboard):
+    """Keeps what it is shown."""
+
+    shows_videos = True
+
+    def __init__(self):
+        self.histograms, self.films, self.tables, self.references = [], [], {}, []
+
+    def log(self, step, metrics):
+        """Leave it: this is about the rest."""
+
+    def close(self):
+        """Say where it lies."""
+        return "recorder: here"
+
+    def log_histogram(self, step, name, values):
+        """Keep it."""
+        self.histograms.append((step, name, values))
+
+    def log_video(self, step, name, path):
+        """Keep it."""
+        self.films.append((step, name, path))
+
+    def log_table(self, name, columns, rows):
+        """Keep it."""
+        self.tables[name] = (columns, rows)
+
+    def log_references(self, step, references):
+        """Keep it."""
+        self.references.append((step, references))
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch):
+    monkeypatch.setattr(watching, "STEPS", 6)
+    monkeypatch.setattr(watching, "FLOCKS", 0)  # that is one
+
+
+def _config(runs, name="dagger", sizes=4, **others):
+    return TrainConfig(
+        env=FlockingConfig(num_agents=sizes),
+        model=ModelConfig(name="pair_force", hidden=8),
+        trainer=TRAINERS[name],
+        runs=str(runs),
+        threads=1,
+        **others,
+    )
+
+
+@pytest.fixture
+def watch(tmp_path):
+    recorder = Recorder()
+    config = _config(tmp_path, sizes=[4, 5], video_rounds=100)
+    run = RunFolder.create(tmp_path, "dagger", "seed: 0\n")
+    policies = {"idle": reference_policies(config.env)["zero action"]}
+    watch = Watch(config, run, Dashboards({"recorder": lambda: recorder}))
+    watch.on_start(policies)
+    return watch, recorder
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_training_is_the_same_to_the_last_bit(tmp_path, name, monkeypatch):
+    recorder = Recorder()
+    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+    monkeypatch.setattr(watching, "write_video", lambda *_: None)
+    plain = train(_config(tmp_path, name))
+    monkeypatch.setattr(training, "make_logger", lambda *_: Dashboards({"recorder": lambda: recorder}))
+    watched = train(_config(tmp_path, name, video_rounds=1))
+    assert len(recorder.films) == len(watched.read_metrics()) - (name == "dagger")  # which begins with round 0
+    assert recorder.tables
+    assert recorder.references
+    assert recorder.histograms
+    weights, others = (load_policy(run.path).state_dict() for run in (plain, watched))
+    assert all(torch.equal(weights[key], others[key]) for key in weights)
+    assert (plain.path / "metrics.jsonl").read_bytes() == (watched.path / "metrics.jsonl").read_bytes()
+
+
+def test_the_final_table_is_a_table():
+    recorder = Recorder()
+    figures = {"mean": 1.0, "low": 0.5, "high": 2.0, "std": 3.0}
+    names = ("error", "leader_distance", "cohesion", "separation", "near_collisions", "reward")
+    row = {name: {**figures, "mean": float(number)} for number, name in enumerate(names)}
+    row |= {"smallest_distance_ever": 7, "lost": 0.1, "diverged": 0.2}
+    alone = row | {"error": None}  # a flock of one has nobody that the policy flies
+    log_evaluation(Dashboards({"recorder": lambda: recorder}), {8: {"mine": row, "alone": alone}})
+    columns, rows = recorder.tables["evaluation/8"]
+    assert columns[:4] == ["flown by", "error", "error, low", "error, high"]
+    assert rows[0] == ["mine", 0.0, 0.5, 2.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 0.1, 0.2]
+    assert len(columns) == len(rows[0])
+    assert all(math.isnan(value) for value in rows[1][1:4])
+    assert rows[1][4:] == rows[0][4:]
+
+
+def test_reference_lines_are_those_of_the_reference_flights(watch):
+    watch, recorder = watch
+    world = watch.config.env
+    for size in (4, 5):
+        columns, rows = recorder.tables[f"references/{size}"]
+        assert [row[0] for row in rows] == list(reference_policies(world))
+        assert dict(zip(columns, rows[-1], strict=True))["error"] == watch.lines[f"{size}/error"]["zero action"] > 0
+    watch.on_round(1, {"4/error": 0.5, "pair_force-K1/5/cohesion": 3.0, "error": 0.5, "4/loss": 0.1})
+    ((step, lines),) = recorder.references
+    assert step == 1
+    assert set(lines) == {"4/error", "pair_force-K1/5/cohesion", "error"}
+    assert lines["error"]["zero action"] == pytest.approx(
+        sum(watch.lines[f"{size}/error"]["zero action"] for size in (4, 5)) / 2
+    )
+    assert lines["4/error"]["expert"] == 0
+    seed = watching.derive_seed(watch.config.seed, "references", 5)
+    expert = reference_policies(world)["expert"]
+    flights = fly(expert, world, num_agents=5, num_flocks=1, steps=6, seed=seed)
+    assert lines["pair_force-K1/5/cohesion"]["expert"] == float(flights.cohesion.mean())
+
+
+def test_lines_are_drawn_on_each_tenth_round_for_new_metrics_and_at_the_end(watch):
+    watch, recorder = watch
+    watch.config.video_rounds = 0
+    for index in range(1, 24):
+        watch.on_round(index, {"4/error": 0.5} | ({"4/lost": 0.0} if index > 12 else {}))
+    watch.on_end({})
+    assert [step for step, _ in recorder.references] == [1, 10, 13, 20, 23]
+
+
+def test_actions_shown_are_those_of_the_agents_that_are_flown(watch):
+    watch, recorder = watch
+    action = torch.arange(2 * 3 * 4 * 3.0).view(2, 3, 4, 3)
+    controlled = torch.ones(2, 3, 4, dtype=torch.bool)
+    controlled[..., 0] = False
+    watch.on_flights(7, TensorDict({"agents": {"action": action, "controlled": controlled}}, [2, 3]))
+    ((step, name, values),) = recorder.histograms
+    assert (step, name) == (7, "4/actions")
+    assert values.tolist() == action[:, :, 1:].flatten().tolist()
+
+
+def test_films_each_so_many_rounds_and_at_the_end(watch):
+    pytest.importorskip("av")
+    pytest.importorskip("matplotlib")
+    watch, recorder = watch
+    watch.config.video_rounds = 2
+    before = torch.get_rng_state()
+    for index in range(4):
+        watch.on_round(index, {})
+    watch.on_end({})
+    assert torch.equal(before, torch.get_rng_state())
+    folder = watch.run.path / "videos"
+    films = [(index, "4/flight", folder / f"round_{index:05d}.mp4") for index in (2, 3)]
+    assert recorder.films == films
+    assert sorted(folder.iterdir()) == [path for *_, path in films]
+
+
+def test_nothing_that_it_calls_draws_from_the_training(watch):
+    watch, _ = watch
+    before = torch.get_rng_state()
+    watch._attempt("a draw", lambda: torch.rand(1))
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_what_fails_is_left_out_with_one_warning(watch, monkeypatch):
+    watch, recorder = watch
+
+    def fail(*_, **__):
+        raise RuntimeError("no room\nleft")
+
+    def go_on():
+        for index in range(1, 10):
+            watch.on_round(index, {"4/error": 0.5})
+
+    watch.config.video_rounds = 2
+    monkeypatch.setattr(watching, "film", fail)
+    with pytest.warns(RuntimeWarning) as caught:
+        go_on()
+    assert [str(warning.message) for warning in caught] == [
+        "dashboards show no films from now on (no room); training goes on"
+    ]
+    assert recorder.references
+
+
+def test_missing_packages_are_said_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(videos.importlib.util, "find_spec", lambda name: None)
+    watch = Watch(_config(tmp_path), None, Dashboards({"recorder": Recorder}))
+
+    def use():
+        watch.on_start({})
+        for index in range(1, 41):
+            watch.on_round(index, {})
+
+    with pytest.warns(RuntimeWarning, match="no films from now on .*pip install av matplotlib") as caught:
+        use()
+    assert len(caught) == 1

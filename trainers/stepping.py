@@ -1,0 +1,87 @@
+"""Optimiser steps that are never taken along a gradient that is no number."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from modgnn_rl.configs.schema import TrainerConfig
+from modgnn_rl.errors import NotFinite
+
+__all__ = ["Stepper", "blame"]
+
+PATIENCE = 20  # updates in a row that may be left out
+
+
+class Stepper:
+    """Clips gradients and steps along them; what is not finite stops the training or is left out.
+
+    Args:
+        module: its parameters are what the optimiser moves.
+        optimizer: the gradients of each of its groups are clipped to ``settings.max_gradient``.
+        settings: of the trainer.
+
+    Attributes:
+        gradient_norm: of the last step, before it was clipped; the largest of the groups.
+        skipped: updates that were left out, in all.
+    """
+
+    def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer, settings: TrainerConfig) -> None:
+        self.module, self.optimizer, self.settings = module, optimizer, settings
+        self.gradient_norm = 0.0
+        self.skipped = self._in_a_row = 0
+
+    def step(self, update: int, loss: Tensor, batch: TensorDictBase) -> bool:
+        """Take one step along the gradients that the parameters hold.
+
+        Args:
+            update: its number, for messages.
+            loss: that they are the gradients of.
+            batch: that it is the loss on.
+
+        Returns:
+            whether it was taken.
+
+        Raises:
+            NotFinite: loss or gradient is not finite, and ``trainer.on_nonfinite`` is ``stop``, or too many were.
+        """
+        norms = [
+            nn.utils.clip_grad_norm_(group["params"], self.settings.max_gradient)
+            for group in self.optimizer.param_groups
+        ]
+        norm = torch.stack([*norms, loss.detach().abs()])
+        if norm.isfinite().all():
+            self.gradient_norm = float(norm[:-1].max())
+            self._in_a_row = 0
+            self.optimizer.step()
+            return True
+        self.skipped += 1
+        self._in_a_row += 1
+        reason = f"update {update} was not made, {blame(loss, batch, self.module)}"
+        if self.settings.on_nonfinite == "stop":
+            raise NotFinite(f"{reason}; trainer.on_nonfinite=skip goes on without such updates")
+        if self._in_a_row >= PATIENCE:
+            raise NotFinite(f"{reason}, nor were the {PATIENCE - 1} before it; resume with smaller steps")
+        warnings.warn(f"{reason}; training goes on", RuntimeWarning, stacklevel=2)
+        return False
+
+
+def blame(loss: Tensor, batch: TensorDictBase, module: nn.Module) -> str:
+    """Say what it is that is not finite: an entry of the data, the loss, or the gradient of a parameter."""
+    for key, value in batch["agents"].items():  # messages elsewhere may be NaN: those that nobody holds
+        bad = ~value.isfinite()
+        if bad.any():
+            window, step, agent = bad.nonzero()[0, :3].tolist()
+            found = float(value[window, step, agent].sum())
+            return (
+                f"since ('agents', '{key}') of agent {agent} at step {step} of window {window} of its data is {found}"
+            )
+    if not loss.isfinite().all():
+        return f"since its loss is {float(loss)} on data that are finite: weights or learning rate are too large"
+    for name, parameter in module.named_parameters():
+        if parameter.grad is not None and not parameter.grad.isfinite().all():
+            return f"since the gradient of {name} is not finite"
+    return "since its gradient is not finite"

@@ -1,0 +1,194 @@
+"""What a dashboard shows of a training beyond its metrics: reference flights, actions, films, the final table."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
+from modgnn_rl.dashboards import one_line
+from modgnn_rl.evaluation import Flights, fly, reference_policies
+from modgnn_rl.loggers import Dashboards
+from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.seeds import derive_seed, seeded
+from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.videos import check_video, film, write_video
+
+__all__ = ["Watch", "log_evaluation"]
+
+STEPS = 200  # of a reference flight and of a film
+FLOCKS = 4  # of 32 agents; of more agents there are fewer
+CHART_ROUNDS = 10  # rounds between which reference lines are drawn on
+MOST_ACTIONS = 30_000  # components in a histogram
+
+
+class Watch(Callback):
+    """Shows on dashboards how others fly, how the policy acts, and films of it.
+
+    The training is the same with it and without it, to the last bit. What of it fails is left out from then on, with
+    one warning.
+
+    Args:
+        config: the run's settings.
+        run: the run folder; films go into ``videos/`` there.
+        dashboards: where to show it.
+        expert: whom the policy learns from; default: Reynolds flocking.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        run: RunFolder,
+        dashboards: Dashboards,
+        expert: TensorDictModuleBase | None = None,
+    ) -> None:
+        self.config, self.run, self.dashboards, self.expert = config, run, dashboards, expert
+        self.policies: Mapping[str, ModGNN] = {}
+        self.lines: dict[str, dict[str, float]] = {}  # of each metric, by the name of who flies
+        self.shown: set[str] = set()  # metrics with lines
+        self.last = self.filmed = 0
+        self._failed: set[str] = set()
+
+    def on_start(self, policies: Mapping[str, ModGNN]) -> None:
+        """Fly the reference policies, and see whether films can be made."""
+        self.policies = policies
+        self._attempt("reference flights", self._fly_references)
+        if self._makes_films:
+            self._attempt("films", check_video)
+
+    def on_flights(self, index: int, flights: TensorDictBase) -> None:
+        """Show how the components of the flown actions are distributed, m/s."""
+        self._attempt("actions", lambda: self._show_actions(index, flights))
+
+    def on_round(self, index: int, metrics: Mapping[str, float]) -> None:
+        """Draw the reference lines on, and make a film where it is time."""
+        found = {name for name in metrics if self._line(name) in self.lines}
+        is_time = index % CHART_ROUNDS == 0 or not found <= self.shown
+        self.shown |= found
+        self.last = index
+        if is_time:
+            self._attempt("reference lines", self._draw_lines)
+        if self._makes_films and index and index % self.config.video_rounds == 0:
+            self._attempt("films", self._film)
+
+    def on_end(self, policies: Mapping[str, ModGNN]) -> None:
+        """Draw the lines to the end, and film what there is at last."""
+        if self.last % CHART_ROUNDS:
+            self._attempt("reference lines", self._draw_lines)
+        if self._makes_films and self.filmed != self.last:
+            self._attempt("films", self._film)
+
+    @property
+    def _makes_films(self) -> bool:
+        return self.config.video_rounds > 0 and self.dashboards.shows_videos
+
+    def _attempt(self, what: str, action: Callable[[], Any]) -> None:
+        """Do something that must neither stop the training nor draw from its random numbers."""
+        if what in self._failed or not self.dashboards:
+            return
+        try:
+            with seeded(derive_seed(self.config.seed, "watching"), self.config.device):
+                action()
+        except Exception as error:  # whatever a dashboard lacks, training goes on
+            self._failed.add(what)
+            warnings.warn(
+                f"dashboards show no {what} from now on ({one_line(error)}); training goes on",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+
+    def _fly_references(self) -> None:
+        """Measure the flights of the reference policies at each size."""
+        world = self.config.env
+        for size in world.sizes:
+            rows = {
+                name: _measures(
+                    fly(
+                        policy,
+                        world,
+                        num_agents=size,
+                        num_flocks=max(1, FLOCKS * REFERENCE_SIZE // size),
+                        steps=self._steps,
+                        seed=derive_seed(self.config.seed, "references", size),
+                        device=self.config.device,
+                        expert=self.expert,
+                    ),
+                    self._steps,
+                )
+                for name, policy in reference_policies(world, self.expert).items()
+            }
+            measures = list(next(iter(rows.values())))
+            self.lines |= {f"{size}/{name}": {who: row[name] for who, row in rows.items()} for name in measures}
+            table: list[list[str | float]] = [[who, *row.values()] for who, row in rows.items()]
+            self.dashboards.log_table(f"references/{size}", ["flown by", *measures], table)
+        for name in ("error", "reward"):
+            lines = [self.lines[f"{size}/{name}"] for size in world.sizes]
+            self.lines[name] = {who: sum(line[who] for line in lines) / len(lines) for who in lines[0]}
+
+    @property
+    def _steps(self) -> int:
+        return min(STEPS, self.config.env.max_steps)
+
+    def _line(self, metric: str) -> str:
+        """Under what name a metric's lines are kept, whose own name may begin with that of a policy."""
+        return metric if metric in self.lines else "/".join(metric.split("/")[-2:])
+
+    def _draw_lines(self) -> None:
+        self.dashboards.log_references(self.last, {name: self.lines[self._line(name)] for name in sorted(self.shown)})
+
+    def _show_actions(self, index: int, flights: TensorDictBase) -> None:
+        flown = flights["agents", "action"][flights["agents", "controlled"]].flatten()
+        size = flights["agents", "action"].shape[-2]
+        self.dashboards.log_histogram(index, f"{size}/actions", flown[:: max(1, len(flown) // MOST_ACTIONS)])
+
+    def _film(self) -> None:
+        """Film the first policy with the first size; always the same flight, so that films can be compared."""
+        world, folder = self.config.env, self.run.path / "videos"
+        size = world.sizes[0]
+        frames = film(
+            next(iter(self.policies.values())),
+            world,
+            num_agents=size,
+            steps=self._steps,
+            seed=derive_seed(self.config.seed, "references", size),
+            device=self.config.device,
+        )
+        folder.mkdir(exist_ok=True)
+        path = folder / f"round_{self.last:05d}.mp4"
+        write_video(path, frames, world.control_frequency)
+        self.filmed = self.last
+        self.dashboards.log_video(self.last, f"{size}/flight", path)
+
+
+def _measures(flights: Flights, steps: int) -> dict[str, float]:
+    """Figures of flights by the names that trainers give to those of the policy's own."""
+    names = ("error", "leader_distance", "cohesion", "separation", "near_collisions", "lost", "diverged")
+    means = {name: float(getattr(flights, name).double().mean()) for name in names}
+    smallest, reward = float(flights.smallest_distance.min()), float(flights.reward.mean()) / steps
+    return {**means, "smallest_distance": smallest, "reward": reward}
+
+
+def log_evaluation(dashboards: Dashboards, tables: Mapping[int, Mapping[str, Any]]) -> None:
+    """Show the evaluation on dashboards, a table for each number of agents.
+
+    Args:
+        dashboards: where.
+        tables: by number of agents, as `modgnn_rl.table.summarise_flights` makes them.
+    """
+    means = ("error", "leader_distance", "cohesion", "separation", "near_collisions", "reward")
+    plain = ("smallest_distance_ever", "lost", "diverged")
+    columns = ["flown by", "error", "error, low", "error, high", *means[1:], *plain]
+    for size, table in tables.items():
+        rows = []
+        for name, row in table.items():
+            error, *others = (row[mean] or {} for mean in means)
+            figures = [error.get(key, math.nan) for key in ("mean", "low", "high")]
+            figures += [other.get("mean", math.nan) for other in others]
+            rows.append([name, *figures, *(float(row[name]) for name in plain)])
+        dashboards.log_table(f"evaluation/{size}", columns, rows)
