@@ -32,7 +32,15 @@ from modgnn_rl.tensors import pair_distances
 __all__ = ["WITHOUT_EFFECT", "FlightDataset", "FlightWindows"]
 
 # Settings of a world that neither flights, nor graphs as matrices, nor the expert's actions depend on.
-WITHOUT_EFFECT = ("max_steps", "max_links", "compile", "max_distance", "collision_distance", "max_colliding")
+WITHOUT_EFFECT = (
+    "max_steps",
+    "max_links",
+    "compile",
+    "max_distance",
+    "collision_distance",
+    "max_colliding",
+    "on_nonfinite",
+)
 
 
 class FlightDataset:
