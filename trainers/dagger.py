@@ -64,8 +64,8 @@ def dagger(session: Session) -> dict[str, ModGNN]:
                 for _ in range(stretches):
                     flights = journal.show(group.fly(share))
                     group.keep(flights)
-                    if index == 0:
-                        held_out[size].keep(held_out[size].fly(share))
+                for _ in range(cloning_stretches if not held_out[size].seen else 0):
+                    held_out[size].keep(held_out[size].fly(expert_share=1.0))
                 if index == 0:
                     group.mixture.restart()
                 metrics |= flight_metrics(flights, config.env)

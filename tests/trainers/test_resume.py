@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 import torch
 
-from modgnn_rl import training
+from modgnn_rl import load_policy, training
 from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
+from modgnn_rl.errors import InputError
 from modgnn_rl.interruption import Stopped
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.trainers.callbacks import Callback
@@ -120,3 +121,22 @@ def test_a_stopped_run_ends_as_one_that_was_not(tmp_path, name):
     resume(run.path)
     assert run.state == "finished"
     _assert_equal(_all_of(straight), _all_of(run))
+
+
+@pytest.mark.parametrize("how", ["another number of agents", "no data in checkpoints"])
+def test_flocks_or_data_that_begin_anew(tmp_path, capsys, how):
+    kept = how == "another number of agents"
+    run = _stop(tmp_path, trainer=DAggerConfig(**DAGGER, checkpoint_data=kept))
+    before = load_policy(run.path).state_dict()
+    resume(run.path, {"env.num_agents": [3, 5]} if kept else {})
+    assert ("begin anew, with no data, because of env.num_agents=[3, 5]" in capsys.readouterr().out) == kept
+    assert [line["step"] for line in run.read_metrics()] == [0, 1, 2, 3, 4]
+    assert any(not torch.equal(value, before[name]) for name, value in load_policy(run.path).state_dict().items())
+
+
+def test_what_cannot_change_is_named_and_nothing_is_touched(tmp_path):
+    run = _stop(tmp_path, trainer=DAggerConfig(**DAGGER))
+    before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=r"cannot change model\.hidden from 32 to 64"):
+        resume(run.path, {"model.hidden": 64})
+    assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == before
