@@ -26,13 +26,12 @@ class Stepper:
 
     Attributes:
         gradient_norm: of the last step, before it was clipped; the largest of the groups.
-        skipped: updates that were left out, in all.
     """
 
     def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer, settings: TrainerConfig) -> None:
         self.module, self.optimizer, self.settings = module, optimizer, settings
         self.gradient_norm = 0.0
-        self.skipped = self._in_a_row = 0
+        self._in_a_row = 0
 
     def step(self, update: int, loss: Tensor, batch: TensorDictBase) -> bool:
         """Take one step along the gradients that the parameters hold.
@@ -48,17 +47,15 @@ class Stepper:
         Raises:
             NotFinite: loss or gradient is not finite, and ``trainer.on_nonfinite`` is ``stop``, or too many were.
         """
-        norms = [
-            nn.utils.clip_grad_norm_(group["params"], self.settings.max_gradient)
-            for group in self.optimizer.param_groups
-        ]
-        norm = torch.stack([*norms, loss.detach().abs()])
-        if norm.isfinite().all():
-            self.gradient_norm = float(norm[:-1].max())
+        groups = [group["params"] for group in self.optimizer.param_groups]
+        norms = [nn.utils.get_total_norm([p.grad for p in group if p.grad is not None]) for group in groups]
+        if torch.stack([*norms, loss.detach()]).isfinite().all():
+            for group, norm in zip(groups, norms, strict=True):  # not before: it would spread what is not finite
+                nn.utils.clip_grads_with_norm_(group, self.settings.max_gradient, norm)
+            self.gradient_norm = float(torch.stack(norms).max())
             self._in_a_row = 0
             self.optimizer.step()
             return True
-        self.skipped += 1
         self._in_a_row += 1
         reason = f"update {update} was not made, {blame(loss, batch, self.module)}"
         if self.settings.on_nonfinite == "stop":
@@ -80,7 +77,9 @@ def blame(loss: Tensor, batch: TensorDictBase, module: nn.Module) -> str:
                 f"since ('agents', '{key}') of agent {agent} at step {step} of window {window} of its data is {found}"
             )
     if not loss.isfinite().all():
-        return f"since its loss is {float(loss)} on data that are finite: weights or learning rate are too large"
+        return (
+            f"since its loss is {float(loss.detach())} on data that are finite: weights or learning rate are too large"
+        )
     for name, parameter in module.named_parameters():
         if parameter.grad is not None and not parameter.grad.isfinite().all():
             return f"since the gradient of {name} is not finite"
