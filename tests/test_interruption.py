@@ -1,0 +1,88 @@
+"""The first signal lets a step end, the second does not."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from modgnn_rl.interruption import Interruption, Stopped
+
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+
+
+@pytest.mark.parametrize("number", CODES)
+def test_a_signal_waits_for_the_check(number, capfd):
+    done = []
+
+    def work():
+        with Interruption().listen() as interruption, interruption.deferred("Stopping soon."):
+            os.kill(os.getpid(), number)
+            done.append("the step")
+            assert interruption.is_asked_for
+            interruption.check()
+            done.append("too much")
+
+    with pytest.raises(Stopped) as stopped:
+        work()
+    assert done == ["the step"]
+    assert stopped.value.code == CODES[number]
+    assert "Stopping soon." in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("number", CODES)
+def test_elsewhere_it_stops_at_once(number):
+    done = []
+
+    def work():
+        with Interruption().listen():
+            os.kill(os.getpid(), number)
+            done.append("too much")
+
+    with pytest.raises(Stopped):
+        work()
+    assert not done
+
+
+def test_the_handlers_of_before_are_given_back():
+    before = [signal.getsignal(number) for number in CODES]
+    with Interruption().listen() as interruption:
+        assert signal.getsignal(signal.SIGTERM) != before[1]
+        assert not interruption.is_asked_for
+        interruption.check()
+    assert [signal.getsignal(number) for number in CODES] == before
+
+
+def test_another_thread_listens_to_nothing():
+    before, heard = signal.getsignal(signal.SIGTERM), []
+
+    def work():
+        with Interruption().listen():
+            heard.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert heard == [before]
+
+
+@pytest.mark.parametrize("number", CODES)
+def test_the_second_ends_the_process_whatever_it_does(number):
+    program = f"""
+import os, time
+from modgnn_rl.interruption import Interruption
+with Interruption().listen() as interruption:
+    with interruption.deferred("Stopping soon."):
+        try:
+            for _ in range(2):
+                os.kill(os.getpid(), {int(number)})
+        finally:
+            time.sleep(600)
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == CODES[number]
+    assert ended.stderr.strip() == "Stopping soon."
