@@ -104,13 +104,20 @@ def bc(session: Session) -> dict[str, ModGNN]:
 @contextlib.contextmanager
 def _own_folders(run: RunFolder, members: Mapping[str, TrainConfig], by_name: Mapping[str, Learner]) -> Iterator[None]:
     """At the end, after Ctrl-C too, give each of several policies a run folder of its own inside the run's."""
-    try:
-        yield
-    finally:
+
+    def write() -> None:
         for name, member in members.items() if len(members) > 1 else ():
             own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
             learner = by_name[name]
-            save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.flown.state_dict()}, {})
+            if learner.updates_done:  # a run stopped before it went on leaves what it had
+                save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.flown.state_dict()}, {})
+
+    try:
+        yield
+    except KeyboardInterrupt:
+        write()
+        raise
+    write()
 
 
 def _named(by_name: dict[str, Any], metric: str, values: Sequence[float]) -> dict[str, float]:
