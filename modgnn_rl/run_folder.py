@@ -167,11 +167,12 @@ class RunFolder:
 
         Args:
             state: ``training``, ``evaluating``, ``finished``, ``stopped`` (it can be resumed) or ``failed``.
-            figures: what else there is to say; what was said before stays.
+            figures: what else there is to say, such as a ``reason``; what was said before stays, but for that.
         """
         now = datetime.now().astimezone().isoformat(timespec="seconds")
         fresh = {"state": state, "updated": now, "pid": os.getpid(), "host": platform.node()}
-        status = {"started": now, **self.status, **fresh, **figures}
+        before = {name: value for name, value in self.status.items() if name != "reason"}  # why it ended before
+        status = {"started": now, **before, **fresh, **figures}
         self.write("status.json", json.dumps(status, indent=2) + "\n")
 
     @property

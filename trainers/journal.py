@@ -206,11 +206,11 @@ class Journal:
             scores.clear()
             if score >= self._best.get(name, math.inf):
                 continue
-            self._best[name] = score
             folder = self.run.best if len(self._scores) == 1 else self.run.path / name / "best"
             policy = {"policy": self.learners[name].flown.state_dict()}
             try:
                 save_checkpoint(folder, self.round, policy, {"score": score}, keep=1)
+                self._best[name] = score
             except OSError as error:
                 self._complain("the best policy", error, last=False)
 

@@ -140,3 +140,36 @@ def test_what_cannot_change_is_named_and_nothing_is_touched(tmp_path):
     with pytest.raises(InputError, match=r"cannot change model\.hidden from 32 to 64"):
         resume(run.path, {"model.hidden": 64})
     assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == before
+
+
+def test_the_best_policy_is_kept_beside_the_last(tmp_path):
+    better = {"bc": "validation_loss", "dagger": "error"}
+    for name, metric in better.items():
+        run = train(_config(tmp_path / name, **RUNS[name]))
+        records = [record[metric] for record in run.read_metrics() if record[metric] == record[metric]]
+        found = load_checkpoint(run.best)
+        assert set(found.tensors) == {"policy"}
+        blocks = [run.read_metrics()[start : start + 5] for start in range(0, len(run.read_metrics()), 5)]
+        means = [[record[metric] for record in block if record[metric] == record[metric]] for block in blocks]
+        assert found.state["score"] == pytest.approx(min(sum(mean) / len(mean) for mean in means if mean))
+        assert records
+        load_policy(run.path, which="best")
+
+
+def test_a_run_that_fails_leaves_the_policies_of_before(tmp_path):
+    settings = RUNS["bc of several, with noise from the error"]
+    run = train(_config(tmp_path, **settings))
+    before = {path: path.read_bytes() for path in run.path.glob("*/checkpoints/*/*")}
+    assert len(before) >= 4 * 3  # of four policies
+
+    class Break(Callback):
+        def on_start(self, policies):
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        resume(run.path, {"trainer.cloning_updates": 8}, callbacks=[Break()])
+    assert run.state == "failed"
+    assert {path: path.read_bytes() for path in run.path.glob("*/checkpoints/*/*")} == before
+    resume(run.path)
+    assert run.state == "finished"
+    assert "reason" not in run.status
