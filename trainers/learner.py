@@ -77,15 +77,15 @@ class Learner:
         """The loss of the averaged policy on a batch of held-out data."""
         return validate_together([self], buffer)[0]
 
-    def prepare(self, batch: TensorDictBase, *, turn: bool, validate: bool = False) -> Tensor:
+    def prepare(self, batch: TensorDictBase, generator: torch.Generator, *, turn: bool) -> Tensor:
         """Rotate and hide in a batch of windows [S, W], in place, and choose the agents that count, bool [S, N].
 
         Args:
             batch: the windows.
+            generator: source of randomness.
             turn: whether to rotate.
-            validate: draw at random so that training does not notice.
         """
-        settings, generator = self.settings, self.validating if validate else self.generator
+        settings = self.settings
         if turn:
             rotations = random_rotations(len(batch), batch["agents", "observation"], generator)
             vectors: list[NestedKey] = [("agents", "observation"), ("agents", "expert_action")]
@@ -178,7 +178,7 @@ def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int
     records = []
     for _ in range(updates):
         batch = buffer.sample()
-        receivers = first.prepare(batch, turn=turn)
+        receivers = first.prepare(batch, first.generator, turn=turn)
         for learner in learners:
             learner.optimizer.zero_grad()
         if alike and batch["agents", "controlled"].numel() * receivers.shape[-1] <= STACKED_PAIRS:
@@ -197,7 +197,8 @@ def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int
 def validate_together(learners: Sequence[Learner], buffer: ReplayBuffer) -> list[float]:
     """The loss of the averaged policy of each learner, on one batch of held-out data."""
     batch = buffer.sample()
-    receivers = learners[0].prepare(batch, turn=any(learner.turns for learner in learners), validate=True)
+    first = learners[0]
+    receivers = first.prepare(batch, first.validating, turn=any(learner.turns for learner in learners))
     return [float(imitation_loss(learner.flown, batch, receivers)) for learner in learners]
 
 
