@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from torchrl.record import CSVLogger, TensorboardLogger, WandbLogger
 
 from modgnn_rl.configs.schema import WandbConfig
+from modgnn_rl.errors import one_line
 from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.settings import flat
 
-__all__ = ["CsvFiles", "Dashboard", "Tensorboard", "Wandb", "one_line"]
+__all__ = ["CsvFiles", "Dashboard", "Tensorboard", "Wandb"]
 
 References = Mapping[str, Mapping[str, float]]
 
@@ -68,7 +70,7 @@ class CsvFiles(Dashboard):
 
     def __init__(self, run: RunFolder, about: Mapping[str, str]) -> None:
         self.logger = CSVLogger(exp_name="csv", log_dir=str(run.path))
-        self.logger.log_hparams(_flat({**run.config, "made_with": about}))
+        self.logger.log_hparams(_shown(run.config, about))
 
     def log_table(self, name: str, columns: Sequence[str], rows: Sequence[Sequence[str | float]]) -> None:
         """Write ``csv/tables/<name>.csv``."""
@@ -93,7 +95,7 @@ class Tensorboard(Dashboard):
 
         self.logger = TensorboardLogger(exp_name="tensorboard", log_dir=str(run.path))
         self.references: dict[str, Any] = {}
-        settings = _flat({**run.config, "made_with": about})
+        settings = _shown(run.config, about)
         self.log_table("settings", ("setting", "value"), list(settings.items()))
         for summary in hparams(settings, {"error": 0.0}):  # TorchRL's would list the run twice
             self._writer.file_writer.add_summary(summary)
@@ -247,17 +249,7 @@ class Wandb(Dashboard):
         return f"wandb: {url}" if settings.mode == "online" else f"wandb: offline run in {settings.sync_dir}; {send}"
 
 
-def one_line(error: BaseException) -> str:
-    """Return the first line of an exception."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str | float]:
-    """Nested settings as one dictionary with dotted keys; what is no number is a text."""
-    flat: dict[str, str | float] = {}
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value if isinstance(value, (bool, int, float)) else str(value)
-    return flat
+def _shown(config: Mapping[str, Any], about: Mapping[str, str]) -> dict[str, str | float]:
+    """Settings, and what a run was made with, by their dotted names; what is no number is a text."""
+    leaves = flat({**config, "made_with": about})
+    return {key: value if isinstance(value, (bool, int, float)) else str(value) for key, value in leaves.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["InputError", "NotFinite"]
+__all__ = ["InputError", "NotFinite", "one_line"]
 
 
 class InputError(ValueError):
@@ -18,3 +18,8 @@ class NotFinite(InputError):
 
     Its message says whose they are and when, what was found, and which setting helps. No bug, hence an `InputError`.
     """
+
+
+def one_line(error: BaseException) -> str:
+    """The first line of what an exception says, or its kind where it says nothing."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]

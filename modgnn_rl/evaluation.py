@@ -27,7 +27,7 @@ from modgnn_rl.metrics import (
 )
 from modgnn_rl.progress import Progress
 
-__all__ = ["Flights", "evaluate", "fly", "reference_policies"]
+__all__ = ["Flights", "endless_env", "evaluate", "fly", "reference_policies"]
 
 QUARTERS = 4
 FRAME = 10  # cohesion, the only costly metric, is taken at each tenth step
@@ -92,6 +92,23 @@ def _zero_action(observation: Tensor) -> Tensor:
     return torch.zeros_like(observation[..., :3])
 
 
+def endless_env(
+    policy: TensorDictModuleBase,
+    config: FlockingConfig,
+    num_flocks: int,
+    num_agents: int,
+    *,
+    steps: int,
+    seed: int,
+    device: torch.device | str = "cpu",
+) -> TransformedEnv:
+    """A world in which every flock flies ``steps`` steps, whatever happens to it, with the policy's recurrent state."""
+    world = dataclasses.replace(config, max_distance=torch.inf, max_colliding=1.0, max_steps=steps)
+    base = FlockingEnv(num_flocks, num_agents, config=world, seed=seed, device=device)
+    primers = get_primers_from_module(policy, warn=False)
+    return TransformedEnv(base, Compose(InitTracker(), *([primers] if primers is not None else [])))
+
+
 @torch.no_grad()
 def fly(
     policy: TensorDictModuleBase,
@@ -121,10 +138,7 @@ def fly(
         progress: counts flock-steps.
         expert: what errors are measured against, writes ``("agents", "expert_action")``; default: Reynolds flocking.
     """
-    world = dataclasses.replace(config, max_distance=torch.inf, max_colliding=1.0, max_steps=steps)
-    base = FlockingEnv(num_flocks, num_agents, config=world, seed=seed, device=device)
-    primers = get_primers_from_module(policy, warn=False)
-    env = TransformedEnv(base, Compose(InitTracker(), *([primers] if primers is not None else [])))
+    env = endless_env(policy, config, num_flocks, num_agents, steps=steps, seed=seed, device=device)
     expert = expert or Reynolds.for_env(config)
     means = _Means(num_flocks, device)
     quarters = torch.zeros(num_flocks, QUARTERS, device=device)

@@ -16,8 +16,8 @@ from typing import Any
 import torch
 
 from modgnn_rl.configs.schema import TrainConfig, as_list
-from modgnn_rl.dashboards import CsvFiles, Dashboard, Tensorboard, Wandb, one_line
-from modgnn_rl.errors import InputError
+from modgnn_rl.dashboards import CsvFiles, Dashboard, Tensorboard, Wandb
+from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.run_folder import RunFolder
 
 __all__ = ["Dashboards", "check_logger", "made_with", "make_logger"]

@@ -13,6 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, MAPPOConfig, TrainConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.settings import flat
 
 __all__ = ["TRAINER_SETTINGS", "begins_anew", "changed_config", "differences", "stored_config", "with_stored_trainer"]
 
@@ -36,7 +37,6 @@ FIXED = (
 # What flights and data were made for: with another of these, flocks begin anew, with no data.
 FLOWN = (
     "env",
-    "collector",
     "device",
     "trainer.num_envs",
     "trainer.held_out",
@@ -45,7 +45,7 @@ FLOWN = (
     "trainer.replacement",
     "trainer.hide_velocity",
 )
-NOT_FLOWN = ("env.on_nonfinite", "collector.timeout")
+NOT_FLOWN = ("env.on_nonfinite",)
 
 
 def stored_config(run: RunFolder) -> TrainConfig:
@@ -92,7 +92,7 @@ def differences(old: TrainConfig, new: TrainConfig) -> dict[str, tuple[Any, Any]
     Raises:
         InputError: a run that has begun cannot change one of these.
     """
-    before, after = (dict(_flat(OmegaConf.to_container(OmegaConf.structured(config)))) for config in (old, new))
+    before, after = (flat(cast(Any, OmegaConf.to_container(OmegaConf.structured(config)))) for config in (old, new))
     found = {key: (before.get(key), value) for key, value in after.items() if before.get(key) != value}
     fixed = [f"{key} from {was} to {value}" for key, (was, value) in found.items() if _is_among(key, FIXED)]
     if fixed:
@@ -123,13 +123,6 @@ def with_stored_trainer(arguments: Sequence[str]) -> list[str]:
                     trainer = RunFolder.open(Path(argument.partition("=")[2])).config["trainer"]["name"]
                     named.insert(index + 1, f"trainer={trainer}")
     return named
-
-
-def _flat(tree: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """The leaves of nested dicts by their dotted names."""
-    if not isinstance(tree, dict):
-        return [(prefix[:-1], tree)]
-    return [leaf for key, value in tree.items() for leaf in _flat(value, f"{prefix}{key}.")]
 
 
 def _is_among(key: str, names: Sequence[str]) -> bool:

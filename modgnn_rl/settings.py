@@ -16,12 +16,12 @@ import copy
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from modgnn_rl.errors import InputError
 
-__all__ = ["check", "setting", "suggestion"]
+__all__ = ["check", "flat", "setting", "suggestion"]
 
 
 def setting(
@@ -107,6 +107,14 @@ def _check_value(name: str, value: Any, rule: Any) -> None:
     for broken, expected in bounds:
         if broken:
             raise InputError(f"{name}={value} is out of range: it must be {expected} ({rule['doc']})")
+
+
+def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by their dotted names, as in ``{"env.comm_range": 3.5}``."""
+    leaves: dict[str, Any] = {}
+    for key, value in tree.items():
+        leaves |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return leaves
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:

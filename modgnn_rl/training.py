@@ -19,7 +19,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
-from modgnn_rl.errors import InputError
+from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation import evaluate
 from modgnn_rl.interruption import Interruption
 from modgnn_rl.loading import load_policy, stored_world
@@ -157,9 +157,8 @@ def _work(
 def _note_end(run: RunFolder, error: BaseException) -> None:
     """Say in the run folder, and where it was asked for on the terminal, that a run has ended before its time."""
     stopped = isinstance(error, KeyboardInterrupt)
-    reason = (str(error).strip() or type(error).__name__).splitlines()[0]
     with contextlib.suppress(OSError):
-        run.note_status("stopped" if stopped else "failed", reason=reason)
+        run.note_status("stopped" if stopped else "failed", reason=one_line(error))
     if stopped:
         resuming = shlex.quote(f"resume={run.path}")
         print(f"Stopped; to go on: python -m modgnn_rl.train {resuming}", file=sys.stderr, flush=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib.util
 import io
 import os
@@ -16,12 +15,11 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, InitTracker, TransformedEnv
-from torchrl.modules import get_primers_from_module, set_recurrent_mode
+from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
+from modgnn_rl.evaluation import endless_env
 from modgnn_rl.experts import as_matrix
 
 __all__ = ["Frame", "as_gif", "check_video", "film", "write_video"]
@@ -83,12 +81,7 @@ def film(
         seed: seed of start and leader.
         device: where to fly.
     """
-    world = dataclasses.replace(config, max_distance=torch.inf, max_colliding=1.0, max_steps=steps)
-    primers = get_primers_from_module(policy, warn=False)
-    env = TransformedEnv(
-        FlockingEnv(1, num_agents, config=world, seed=seed, device=device),
-        Compose(InitTracker(), *([primers] if primers is not None else [])),
-    )
+    env = endless_env(policy, config, 1, num_agents, steps=steps, seed=seed, device=device)
     frames = []
     with contextlib.closing(env), set_recurrent_mode(False):
         tensordict = env.reset()

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
-from modgnn_rl.dashboards import one_line
+from modgnn_rl.errors import one_line
 from modgnn_rl.evaluation import Flights, fly, reference_policies
 from modgnn_rl.loggers import Dashboards
 from modgnn_rl.modgnn import ModGNN
