@@ -9,6 +9,7 @@ import os
 import platform
 import re
 import shutil
+import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -75,10 +76,23 @@ class RunFolder:
             for folder in missing:
                 with contextlib.suppress(OSError):
                     folder.rmdir()
-            raise InputError(
-                f"cannot write into {root} ({error.strerror}): choose a folder you can write to"
-            ) from error
+            raise _unwritable(root, error) from error
         return cls.open(path)
+
+    @staticmethod
+    def check_root(root: str | os.PathLike[str]) -> None:
+        """Check that `create` could make folders in a root, without leaving anything.
+
+        Raises:
+            InputError: it could not.
+        """
+        root = Path(root).absolute()
+        there = next(folder for folder in (root, *root.parents) if folder.exists())
+        try:
+            with tempfile.TemporaryDirectory(dir=there):
+                pass
+        except OSError as error:
+            raise _unwritable(root, error) from error
 
     @classmethod
     def create_inside(cls, parent: RunFolder, name: str, config_yaml: str) -> RunFolder:
@@ -252,6 +266,10 @@ class RunFolder:
         """Write a text file into the folder, whole or not at all, and return its path."""
         write_atomically(self.path / name, text)
         return self.path / name
+
+
+def _unwritable(root: Path, error: OSError) -> InputError:
+    return InputError(f"cannot write into {root} ({error.strerror}): choose a folder you can write to")
 
 
 def _make_unique(path: Path) -> Path:

@@ -8,10 +8,17 @@ import sys
 from modgnn_rl.command import run_command, settings_given
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.resuming import TRAINER_SETTINGS, with_stored_trainer
+from modgnn_rl.run_folder import RunFolder
 
 
 def main(config: TrainConfig) -> None:
     """Train a decentralised flocking policy from the Reynolds expert, and compare it with the expert."""
+    # Folders are looked at before the heavy imports: a typing error must be reported at once.
+    for folder in (config.resume, config.init_from):
+        if folder is not None:
+            RunFolder.open(folder)
+    if config.resume is None:
+        RunFolder.check_root(config.runs)
     from modgnn_rl.training import resume, train
 
     if config.resume is None:

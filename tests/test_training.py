@@ -14,6 +14,7 @@ from tensordict import TensorDict
 
 from modgnn_rl import load_policy
 from modgnn_rl.checkpoint import load_checkpoint
+from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import (
     BCConfig,
     DAggerConfig,
@@ -27,6 +28,8 @@ from modgnn_rl.configs.schema import (
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.train import main
+from modgnn_rl.trainers import watching
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.training import evaluate_run, prepare_torch, train
 
@@ -44,13 +47,22 @@ def _config(runs, trainer, **others):
 
 
 def _dagger(**settings):
-    small = {"cloning_steps": 10, "cloning_updates": 4, "rounds": 3, "round_steps": 5, "round_updates": 2}
+    small = {
+        "cloning_steps": 10,
+        "cloning_updates": 4,
+        "rounds": 3,
+        "round_steps": 5,
+        "round_updates": 2,
+        "held_out": 1,
+    }
     return DAggerConfig(**{**SMALL, **small, **settings})
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> RunFolder:
-    return train(_config(tmp_path_factory.mktemp("runs"), _dagger(), logger="csv"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(watching, "STEPS", 8)  # of the reference flights
+        return train(_config(tmp_path_factory.mktemp("runs"), _dagger(), logger="csv"))
 
 
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
@@ -179,10 +191,6 @@ def _command(module, *arguments, folder):
         (["trainer=bc", "trainer.rounds=3"], "trainer.rounds"),
         (["env.num_agents=[8,0]"], "env.num_agents=0 is out of range"),
         (["env.num_agents=null"], "env.num_agents=None is not a whole number"),
-        (["env.num_agents=[4,4]"], "must name each size once"),
-        (["env.start_distance=9"], "do not fit into a ball"),
-        (["model.hops=0"], "has nothing to learn"),
-        (["trainer.round_updates=1", "env.num_agents=[4,5]"], "too few for 2 sizes"),
         (["trainer.learning_rates=[1e-3]"], "trainer.learning_rates"),
         (["device=tpu9"], "device=tpu9"),
     ],
@@ -193,6 +201,51 @@ def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, arguments, words):
     assert words in done.stderr
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["env.num_agents=[4,4]"], "must name each size once"),
+        (["env.start_distance=9"], "do not fit into a ball"),
+        (["model.hops=0"], "has nothing to learn"),
+        (["trainer.round_updates=1", "env.num_agents=[4,5]"], "too few for 2 sizes"),
+    ],
+)
+def test_a_mistake_that_training_finds_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["train", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        run_command(main, TrainConfig, "train", nodes={"trainer/dagger": DAggerConfig})
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert words in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        ("runs=file/runs", "cannot write into"),
+        ("resume=nowhere", "is no run folder"),
+        ("init_from=.", "is no run folder"),
+    ],
+)
+def test_a_folder_that_cannot_be_used_is_said_before_torch_is_imported(tmp_path, argument, words):
+    (tmp_path / "file").touch()
+    program = f"""
+import atexit, runpy, sys
+atexit.register(lambda: print("torch" in sys.modules))
+sys.argv = ["train", "{argument}"]
+runpy.run_module("modgnn_rl.train", run_name="__main__")
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (2, "False\n")
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_folder_that_is_no_run(tmp_path):
