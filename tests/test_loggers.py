@@ -365,7 +365,14 @@ def test_training_goes_on_without_wandb_and_metrics_are_complete(tmp_path, monke
 
     monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
     trainer = DAggerConfig(
-        num_envs=1, batch_size=16, cloning_steps=8, cloning_updates=2, rounds=12, round_steps=4, round_updates=2
+        num_envs=1,
+        batch_size=16,
+        cloning_steps=8,
+        cloning_updates=2,
+        rounds=12,
+        round_steps=4,
+        round_updates=2,
+        held_out=1,
     )
     whole = TrainConfig(
         env=FlockingConfig(num_agents=4, max_steps=4),

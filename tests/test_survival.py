@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import multiprocessing
 import os
@@ -26,7 +27,7 @@ from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.training import resume, train
 
 SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}
-TRAINERS = {
+TRAINERS: dict[str, Any] = {
     "bc": BCConfig(**SMALL, cloning_steps=24, cloning_updates=30),
     "dagger": DAggerConfig(
         **SMALL, cloning_steps=12, cloning_updates=6, rounds=20, round_steps=12, round_updates=2, expert_rounds=3
@@ -42,6 +43,9 @@ FILE_CALLS = {"open", "write", "close", "mkdir", "fsync", "replace", "rename", "
 @pytest.fixture(autouse=True)
 def _without_evaluation(monkeypatch):
     monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
+
+
+TRAINERS["short"] = dataclasses.replace(TRAINERS["dagger"], rounds=6)
 
 
 def _config(runs: Path, trainer: str) -> TrainConfig:
@@ -78,7 +82,7 @@ def _assert_equal(one, other):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("trainer", TRAINERS)
+@pytest.mark.parametrize("trainer", ["bc", "dagger", "mappo"])
 def test_killed_at_random_moments(tmp_path, trainer):
     began = time.monotonic()
     straight = train(_config(tmp_path / "straight", trainer))
@@ -136,11 +140,11 @@ def test_killed_at_every_call_that_touches_a_file_while_a_checkpoint_is_written(
     print(f"killed at {alive_for - 1} calls")
 
 
-def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path):
+def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path, finished):
     def train_on_a_small_disk():
         warnings.simplefilter("default")
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # of a file; the checkpoints are larger
-        train(_config(tmp_path / "runs", "dagger"))
+        train(_config(tmp_path / "runs", "short"))
 
     process = _start(train_on_a_small_disk)
     process.join()
@@ -150,18 +154,17 @@ def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path):
     assert run.state == "failed"
     assert "File too large" in run.status["reason"]
     assert "make room" in run.status["reason"]
-    assert len(run.read_metrics()) == 21  # it went on to the end
+    assert len(run.read_metrics()) == 7  # it went on to the end
     assert [path.name for path in run.checkpoints.iterdir()] == []
     resume(folder)
-    straight = train(_config(tmp_path / "straight", "dagger"))
-    _assert_equal(_contents(straight), _contents(run))
+    _assert_equal(_contents(finished), _contents(run))
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "evaluate_policies", lambda *_, **__: {})
-        return train(_config(tmp_path_factory.mktemp("finished"), "dagger"))
+        return train(_config(tmp_path_factory.mktemp("finished"), "short"))
 
 
 def _damage(path: Path, how: str) -> None:
@@ -182,7 +185,7 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path, finished, how):
         shutil.copytree(finished.path, folder)
         _damage(folder / "checkpoints" / newest.name / file.name, how)
         with pytest.warns(RuntimeWarning, match="CHECKPOINT PASSED OVER"):
-            assert load_checkpoint(folder / "checkpoints").step == 20
+            assert load_checkpoint(folder / "checkpoints").step == 6
     with pytest.warns(RuntimeWarning, match="CHECKPOINT PASSED OVER"):
         run = resume(folder)
     _assert_equal(straight, _contents(run))

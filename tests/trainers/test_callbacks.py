@@ -19,7 +19,9 @@ from modgnn_rl.training import train
 SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 400}
 TRAINERS = {
     "bc": BCConfig(**SMALL, cloning_steps=8, cloning_updates=4, held_out=2),
-    "dagger": DAggerConfig(**SMALL, cloning_steps=8, cloning_updates=2, rounds=3, round_steps=4, round_updates=2),
+    "dagger": DAggerConfig(
+        **SMALL, cloning_steps=8, cloning_updates=2, rounds=3, round_steps=4, round_updates=2, held_out=1
+    ),
     "mappo": MAPPOConfig(
         num_envs=1, iterations=3, round_steps=4, critic_warmup=0, epochs=1, batches=1, critic_hidden=8
     ),

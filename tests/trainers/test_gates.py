@@ -207,7 +207,7 @@ def _without_evaluation(monkeypatch):
 
 def _run(runs, model, **settings):
     small = {"num_envs": 1, "batch_size": 16, "capacity": 100, "cloning_steps": 6, "cloning_updates": 4}
-    small |= {"rounds": 4, "round_steps": 6, "round_updates": 2, "stretch": 3}
+    small |= {"rounds": 4, "round_steps": 6, "round_updates": 2, "stretch": 3, "held_out": 1}
     trainer = DAggerConfig(**{**small, **settings})
     env = FlockingConfig(num_agents=4, max_steps=20)
     return train(TrainConfig(env=env, model=model, trainer=trainer, runs=str(runs), threads=1))

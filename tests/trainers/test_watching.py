@@ -28,7 +28,14 @@ from modgnn_rl.training import train
 TRAINERS = {
     "bc": BCConfig(num_envs=1, batch_size=16, cloning_steps=8, cloning_updates=4, held_out=2),
     "dagger": DAggerConfig(
-        num_envs=1, batch_size=16, cloning_steps=8, cloning_updates=2, rounds=3, round_steps=4, round_updates=2
+        num_envs=1,
+        batch_size=16,
+        cloning_steps=8,
+        cloning_updates=2,
+        rounds=3,
+        round_steps=4,
+        round_updates=2,
+        held_out=1,
     ),
     "mappo": MAPPOConfig(
         num_envs=1, iterations=3, round_steps=4, critic_warmup=0, epochs=1, batches=1, critic_hidden=8
