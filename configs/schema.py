@@ -26,6 +26,7 @@ __all__ = [
     "ImitationConfig",
     "MAPPOConfig",
     "ModelConfig",
+    "RunsConfig",
     "TrainConfig",
     "TrainerConfig",
     "WandbConfig",
@@ -430,3 +431,24 @@ class ExportConfig:
     run: str = setting(MISSING, "run folder")
     output: str | None = setting(None, "folder for the exported agent, made anew; null: agent/ in the run folder")
     threads: int = setting(1, "threads of torch where its latency is measured; 0: one a core", low=0)
+
+
+@dataclass
+class RunsConfig:
+    """A look at runs."""
+
+    runs: str = setting("runs", "folder of the run folders")
+    compare: Any = setting(
+        None, "runs to compare, a list: folders, or parts of names that one run alone has; null: all are listed"
+    )
+    state: Any = setting(
+        None,
+        "list only runs that stand like this, one or several; null: all",
+        choices=("training", "evaluating", "finished", "stopped", "failed", "killed", "unknown", "unreadable"),
+    )
+    sort: str = setting(
+        "started",
+        "order of the list: the newest, the longest or the best at its end",
+        choices=("started", "updated", "seconds", "error", "reward", "validation_loss", "evaluation"),
+    )
+    format: str = setting("text", "how it is written", choices=("text", "markdown", "json"))
