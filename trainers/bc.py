@@ -154,7 +154,7 @@ def _share(settings: BCConfig, unseen: Flocks, window: int) -> ReplayBuffer:
     A dataset holds no messages: windows make them anew.
     """
     # `check_training` has verified it.
-    dataset = FlightDataset.open(str(settings.dataset), verify=False, device=unseen.env.device)
+    dataset = FlightDataset.open(str(settings.dataset), verify=False, device=unseen.device)
     seen = dataset.episodes - settings.held_out
     draws: dict[str, Any] = {
         "length": window,

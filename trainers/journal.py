@@ -19,7 +19,8 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.progress import Progress
 from modgnn_rl.trainers.callbacks import Callback
-from modgnn_rl.trainers.collection import FlockCollector
+from modgnn_rl.trainers.collection import FlockCollector, Flocks
+from modgnn_rl.trainers.remote import RemoteFlights
 from modgnn_rl.trainers.saving import Part, gather, scatter
 from modgnn_rl.trainers.session import Session
 
@@ -61,7 +62,7 @@ class Journal:
         self,
         session: Session,
         learners: Mapping[str, Learns],
-        flocks: Mapping[str, FlockCollector],
+        flocks: Mapping[str, Flocks | FlockCollector | RemoteFlights],
         total: int,
         *,
         unit: str = "updates",
