@@ -196,8 +196,8 @@ class Soak:
         left = [path for path in self.temporary.rglob("*") if path.is_file()]
         if left and self.process.returncode > 0:  # who is killed cannot tidy up
             self.complaints.append(f"{len(left)} temporary files left, such as {left[0]}")
-        shutil.rmtree(self.temporary)
-        self.temporary.mkdir()
+        shutil.rmtree(self.temporary, ignore_errors=True)  # a socket may go just now
+        self.temporary.mkdir(exist_ok=True)
 
 
 def main() -> None:
