@@ -13,7 +13,6 @@ from modgnn_rl.configs.schema import DAggerConfig
 from modgnn_rl.errors import NotFinite
 from modgnn_rl.trainers.stepping import PATIENCE, Stepper
 
-
 ALL = torch.tensor(12)  # agents that count in a batch
 
 
