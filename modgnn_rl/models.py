@@ -18,7 +18,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from modgnn_rl.central import CentralLayer
-from modgnn_rl.communication import GraphAttention, MessagePassing
+from modgnn_rl.communication import Adjacency, GraphAttention, MessagePassing
 from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
 from modgnn_rl.equivariant import VELOCITY_SCALE, Moments, PairForce, VectorSquash, mlp
 from modgnn_rl.errors import InputError
@@ -147,6 +147,13 @@ def modgnn_mlp(spec: LayerSpec) -> ModGNNLayer:
     return ModGNNLayer(spec.hops, f_pre=f_pre, f_mid=f_mid, f_final=f_final)
 
 
+def modgnn_adjacency(spec: LayerSpec) -> ModGNNLayer:
+    """ModGNN-MLP whose f_com is the adjacency: sums of the neighbours' data, not of differences, as in a plain GCN."""
+    layer = modgnn_mlp(spec)
+    layer.f_com = Adjacency()
+    return layer
+
+
 def no_pre(spec: LayerSpec) -> ModGNNLayer:
     """ModGNN-MLP without f_pre: the neighbours' data are summed before any network sees them."""
     f_mid = [mlp(spec.inputs, spec.hidden, LATENT) for _ in range(spec.hops + 1)]
@@ -246,6 +253,7 @@ MODELS: dict[str, Callable[[LayerSpec], ModGNNLayer | CentralLayer]] = {
     "moment_force": moment_force,
     "pair_force": pair_force,
     "modgnn_mlp": modgnn_mlp,
+    "modgnn_adjacency": modgnn_adjacency,
     "no_pre": no_pre,
     "no_mid": no_mid,
     "gcn": gcn,

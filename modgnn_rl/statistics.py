@@ -1,4 +1,4 @@
-"""Summaries over flocks with bootstrap intervals, in plain numpy.
+"""Summaries over flocks and seeds with bootstrap intervals, in plain numpy.
 
 The unit of all statistics is the flock (one episode): agents and time steps of one flock are not independent, so
 average over them first.
@@ -6,6 +6,7 @@ average over them first.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from modgnn_rl.errors import InputError
 
-__all__ = ["Summary", "interquartile_mean", "paired_difference", "summarise"]
+__all__ = [
+    "Interval",
+    "Summary",
+    "interquartile_interval",
+    "interquartile_mean",
+    "paired_difference",
+    "probability_of_improvement",
+    "summarise",
+]
 
 
 @dataclass(frozen=True)
@@ -99,6 +108,110 @@ def interquartile_mean(values: ArrayLike) -> float:
     data = _checked(values)
     cut = data.size // 4
     return float(data[cut : data.size - cut].mean())
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A figure with its confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def interquartile_interval(
+    values: ArrayLike, *, rng: np.random.Generator, confidence: float = 0.95, resamples: int = 2000
+) -> Interval:
+    """Interquartile mean over seeds and flights, and its stratified bootstrap interval (Agarwal et al. 2021).
+
+    A resample draws seeds with replacement, and then, within each seed drawn, flights with replacement. With one seed
+    the interval tells of flights only.
+
+    Args:
+        values: ``[S, F]``, of each seed its flights; infinite values are allowed, they count as the worst.
+        rng: source of the resampling.
+        confidence: coverage of the interval, above 0 and below 1.
+        resamples: bootstrap samples, at least 1.
+
+    Raises:
+        InputError: no values, a NaN, or a setting out of range.
+    """
+    data = _checked_matrix(values)
+
+    def resample() -> NDArray[np.float64]:
+        seeds, flights = data.shape
+        return data[rng.integers(seeds, size=(seeds, 1)), rng.integers(flights, size=data.shape)].ravel()
+
+    return _interval(_middle_mean(data.ravel()), lambda: _middle_mean(resample()), confidence, resamples)
+
+
+def probability_of_improvement(
+    better: ArrayLike,
+    worse: ArrayLike,
+    *,
+    rng: np.random.Generator,
+    paired: bool = True,
+    confidence: float = 0.95,
+    resamples: int = 2000,
+) -> Interval:
+    """Probability that one policy has a lower value than another: ``P(X < Y) + P(X = Y) / 2`` (Agarwal et al. 2021).
+
+    The flights are Agarwal's tasks, the seeds the runs: where both flew the same flights, each flight is compared with
+    itself, for all pairs of seeds. The interval is that of a bootstrap over the seeds of each and over the flights.
+
+    Args:
+        better: ``[S, F]``, of each seed of the one its flights; lower is better.
+        worse: ``[T, G]``, the same of the other.
+        rng: source of the resampling.
+        paired: flight f of the one began like flight f of the other (F = G); else every flight meets every other.
+        confidence: coverage of the interval, above 0 and below 1.
+        resamples: bootstrap samples, at least 1.
+
+    Raises:
+        InputError: no values, a NaN, a setting out of range, or different flights where they should be paired.
+    """
+    x, y = _checked_matrix(better), _checked_matrix(worse)
+    if paired and x.shape[1] != y.shape[1]:
+        raise InputError(f"{x.shape[1]} and {y.shape[1]} flights cannot be paired; give values of the same flights")
+    if paired:
+        a, b = x[:, None], y[None]  # [S, T, F]
+    else:
+        a, b = x[:, None, :, None], y[None, :, None, :]  # [S, T, F, G]
+    wins = (a < b) + (a == b) / 2
+
+    def resample() -> float:
+        lots = [rng.integers(length, size=length) for length in wins.shape]
+        return float(wins[np.ix_(*lots)].mean())
+
+    return _interval(float(wins.mean()), resample, confidence, resamples)
+
+
+def _interval(value: float, resample: Callable[[], float], confidence: float, resamples: int) -> Interval:
+    """Return the percentile bootstrap interval of a figure."""
+    if not 0 < confidence < 1 or resamples < 1:
+        raise InputError(
+            f"confidence={confidence}, resamples={resamples}: give a confidence between 0 and 1 and resamples >= 1"
+        )
+    drawn = [resample() for _ in range(resamples)]
+    tail = (1 - confidence) / 2
+    # A sample, not a mean of two: one of them may be infinite.
+    low, high = np.quantile(drawn, [tail, 1 - tail], method="nearest")
+    return Interval(value, float(low), float(high))
+
+
+def _middle_mean(data: NDArray[np.float64]) -> float:
+    cut = data.size // 4
+    return float(np.sort(data)[cut : data.size - cut].mean())
+
+
+def _checked_matrix(values: ArrayLike) -> NDArray[np.float64]:
+    """Return the values as float64 [S, F], or raise InputError."""
+    data = np.asarray(values, dtype=np.float64)
+    if data.ndim != 2 or data.size == 0:
+        raise InputError(f"values have shape {data.shape}; expected one row a seed and one column a flight")
+    if bad := int(np.isnan(data).sum()):
+        raise InputError(f"{bad} of {data.size} values are no numbers; count those flights as infinite, or say so")
+    return data
 
 
 def _checked(values: ArrayLike) -> NDArray[np.float64]:

@@ -1,0 +1,316 @@
+"""The studies by name: which models fly where, and the tables and figures that answer what is asked."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from modgnn_rl.claims import claim_tables
+from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig, ScaleConfig
+from modgnn_rl.files import write_atomically
+from modgnn_rl.models import make_model
+from modgnn_rl.paper_tables import NAMES, REFERENCES, middle, paper_tables, shown, title_of
+from modgnn_rl.plots import Curve, Estimate, draw_curves, draw_intervals, draw_panels
+from modgnn_rl.report import Details, Figure, Section, gather_provenance, write_report
+from modgnn_rl.reproducing import VALIDATION, Measurements, Study, Subject, World
+from modgnn_rl.tabular import Table, as_csv, as_latex, as_markdown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+__all__ = ["QUESTIONS", "equal_hidden", "study_of", "write_study"]
+
+GNNS = ("modgnn_mlp", "no_mid", "no_pre", "gcn", "gcn_final")
+HOPS = (1, 2, 3)
+KINDS = ("modgnn_mlp", "modgnn_adjacency", "gat", "mpnn")  # of f_com; ModGNN-MLP's is the Laplacian
+SHAPES = ((1, 1), (1, 2), (1, 3), (2, 1), (3, 1))  # layers and hops
+RANGES = (2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0)  # m
+FAULTS: dict[str, tuple[tuple[float, dict[str, Any]], ...]] = {
+    "share of messages lost": tuple((share, {"message_loss": share}) for share in (0.1, 0.3, 0.5)),
+    "delay, steps": tuple((steps, {"delay": int(steps)}) for steps in (1, 2, 4, 8)),
+    "noise of positions, m, and velocities, m/s": tuple(
+        (noise, {"position_noise": noise, "velocity_noise": noise}) for noise in (0.02, 0.05, 0.1, 0.2)
+    ),
+    "drop-outs of an agent, 1/s": tuple((rate, {"dropout_rate": rate}) for rate in (0.01, 0.05, 0.1)),
+}
+QUESTIONS = {
+    "tables": "The paper's tables",
+    "communication": "Which kind of communication f_com serves best?",
+    "layers": "What do layers and hops bring at equal numbers of parameters?",
+    "range": "Which model is most robust to another communication range than the 3.5 m of training?",
+    "faults": "Which model is most robust to lost and late messages, noise and drop-outs?",
+    "size": "How does one set of weights, trained with 32 agents, fly flocks of other sizes?",
+}
+STAGES = {
+    "cloning": "cloning of the expert's flights, as in the paper",
+    "dagger": "cloning, then DAgger",
+    "mappo": "cloning, DAgger, then MAPPO",
+}
+
+
+def study_of(config: ReproduceConfig) -> Study:
+    """The models and worlds of a study."""
+    scale = config.scale
+    every = [Subject(model, hops) for model in GNNS for hops in HOPS]
+    usual = World("study-32", REFERENCE_SIZE, scale.study_flocks, scale.study_steps)
+    if config.study == "communication":
+        kinds = [Subject(model, hops) for model in KINDS for hops in (1, 2)]
+        return Study("communication", kinds, [usual], scale.study_updates)
+    if config.study == "layers":
+        shapes = [
+            Subject(model, hops, layers, equal_hidden(model, layers, hops))
+            for model in ("modgnn_mlp", "no_mid", "no_pre")
+            for layers, hops in SHAPES
+        ]
+        return Study("layers", shapes, [usual], scale.study_updates)
+    if config.study == "tables":
+        worlds = [World(f"N{size}", size, scale.flocks, scale.flight_steps) for size in scale.sizes]
+        return Study("tables", [*every, Subject("central", 1)], worlds, scale.updates)
+    worlds = {"range": _ranges, "faults": _faulty, "size": _sizes}[config.study](scale)
+    return Study("tables", every, worlds, scale.updates)
+
+
+def _ranges(scale: ScaleConfig) -> list[World]:
+    flown = (REFERENCE_SIZE, scale.study_flocks, scale.study_steps)
+    return [World(f"range-{reach}", *flown, {"comm_range": reach}) for reach in RANGES]
+
+
+def _faulty(scale: ScaleConfig) -> list[World]:
+    flown = (REFERENCE_SIZE, scale.study_flocks, scale.study_steps)
+    changes = [change for levels in FAULTS.values() for _, change in levels]
+    return [World("study-32", *flown), *(World(_fault_name(change), *flown, change) for change in changes)]
+
+
+def _fault_name(change: Mapping[str, Any]) -> str:
+    name, level = next(iter(change.items()))
+    return f"fault-{name}-{level}"
+
+
+def _sizes(scale: ScaleConfig) -> list[World]:
+    """Flocks of more agents are fewer, so that about as many agents fly."""
+    return [
+        World(f"size-{size}", size, max(2, scale.study_flocks * min(REFERENCE_SIZE, size) // size), scale.study_steps)
+        for size in scale.study_sizes
+    ]
+
+
+@functools.cache
+def equal_hidden(model: str, layers: int, hops: int) -> int:
+    """The width of the hidden layers with which a model has as many parameters as ModGNN-MLP with K = 1, nearly."""
+
+    def parameters(model: str, hops: int, hidden: int, layers: int) -> int:
+        return sum(weights.numel() for weights in make_model(model, hops, hidden, layers=layers, seed=0).parameters())
+
+    wanted = parameters("modgnn_mlp", 1, 32, 1)
+    return min(range(4, 80), key=lambda hidden: abs(parameters(model, hops, hidden, layers) - wanted))
+
+
+def write_study(measurements: Measurements, folder: Path) -> Path:
+    """Write the tables of a study, each as CSV and LaTeX and all on one page, and the report.
+
+    Returns:
+        the path of ``report.html``; ``tables.md`` is beside it.
+    """
+    config, outcome = measurements.config, measurements.outcome
+    place = folder / (config.study if config.after == "cloning" else f"{config.study}-after-{config.after}")
+    place.mkdir(parents=True, exist_ok=True)
+    tables, figures, text = _tabled(measurements) if config.study == "tables" else _studied(measurements)
+    failed = "\n\n".join(f"Failed: {name}: {reason}." for name, reason in outcome.failures.items())
+    title = f"{QUESTIONS[config.study]} ({config.scale.name}, {config.seeds} seed{'s' if config.seeds > 1 else ''})"
+    about = " ".join([f"Policies made by {STAGES[config.after]}.", text])
+    for name, table in tables.items():
+        write_atomically(place / f"{name}.csv", as_csv(table))
+        write_atomically(place / f"{name}.tex", as_latex(table))
+    page = [f"# {title}", about, failed, *(as_markdown(table) for table in tables.values())]
+    write_atomically(place / "tables.md", "\n\n".join(filter(None, page)))
+    times = "\n".join(f"{seconds:8.1f} s  {name}" for name, seconds in outcome.seconds.items())
+    sections = [
+        *([Section("What failed", failed)] if failed else []),
+        Section("Results", about, [*figures, *tables.values()]),
+        Section("Settings", "", [Details("all settings", _yaml(config)), Details("time of each cell", times)]),
+    ]
+    spent = {"all cells": f"{sum(outcome.seconds.values()) / 60:.1f} min on one process"}
+    return write_report(place, title, sections, gather_provenance(times=spent))
+
+
+def _yaml(config: ReproduceConfig) -> str:
+    return OmegaConf.to_yaml(OmegaConf.structured(config))
+
+
+def _tabled(measurements: Measurements) -> tuple[dict[str, Table], list[Figure], str]:
+    """The paper's tables and claims."""
+    tables = {**claim_tables(measurements), **paper_tables(measurements)}
+    order = ("claims", "table1", "table2", "table2_middle", "table3", "comparisons")
+    figures = [
+        Figure("validation_error", _by_hops(measurements, VALIDATION), "Error on the expert's flights, m²/s²."),
+        Figure("error_in_flight", _by_hops(measurements, "N32"), "Error on flights of the models' own, m²/s²."),
+    ]
+    return {name: tables[name] for name in order}, figures, "The figures of the paper stand beside those found here."
+
+
+def _estimate(measurements: Measurements, row: Subject | str, world: str) -> Estimate | None:
+    found = middle(measurements, row, world, "error")
+    return None if found is None or not np.isfinite(found.high) else Estimate(found.value, found.low, found.high)
+
+
+def _by_hops(measurements: Measurements, world: str) -> Callable[[Canvas], None]:
+    """Draws a row for each model, a marker for each number of hops (and layers), the references as lines."""
+    groups: dict[str, dict[str, Estimate]] = {}
+    for subject in measurements.study.subjects:
+        layers = "" if subject.layers is None else f"L = {subject.layers}, "
+        if (estimate := _estimate(measurements, subject, world)) is not None:
+            groups.setdefault(f"{layers}K = {subject.hops}", {})[NAMES[subject.model]] = estimate
+    lines = {name: _estimate(measurements, name, world) for name in REFERENCES[2:]}
+    references = {name: line.value for name, line in lines.items() if line is not None}
+    return functools.partial(_draw_intervals, groups=groups, references=references)
+
+
+def _draw_intervals(canvas: Canvas, groups: dict[str, dict[str, Estimate]], references: dict[str, float]) -> None:
+    draw_intervals(canvas, groups, x_label="error, m²/s²", references=references, log_x=True)
+
+
+def _studied(measurements: Measurements) -> tuple[dict[str, Table], list[Figure], str]:
+    """A table of errors and one of lost flocks, a row for each model and a column for each world; a figure."""
+    config, study = measurements.config, measurements.study
+    name = config.study
+    if name in ("communication", "layers"):
+        figure = Figure(name, _by_hops(measurements, "study-32"), "Error on flights of the models' own, m²/s².")
+        worlds = {"expert's flights": VALIDATION, "own flights": "study-32"}
+    else:
+        panels = _faults_by_kind() if name == "faults" else _levels_by_hops(study)
+        figure = Figure(name, _panels(measurements, panels), "Error over the level, with 95 % bands, m²/s².")
+        worlds = {_heading(world): world.name for world in study.worlds}
+    usual = next(world.name for world in study.worlds if _is_usual(config, world))
+    tables = {"errors": _errors(measurements, worlds, usual), "lost": _lost(measurements, worlds)}
+    return tables, [figure], _answer(measurements, worlds, usual)
+
+
+def _is_usual(config: ReproduceConfig, world: World) -> bool:
+    same = all(getattr(config.env, name) == value for name, value in world.changes.items())
+    return same and (world.num_agents == REFERENCE_SIZE or config.study != "size")
+
+
+def _heading(world: World) -> str:
+    if world.name.startswith("size-"):
+        return f"N = {world.num_agents}"
+    return ", ".join(f"{name} {value}" for name, value in world.changes.items()) or "as trained"
+
+
+def _rows(measurements: Measurements) -> list[Subject | str]:
+    return [*REFERENCES, *measurements.study.subjects]
+
+
+def _errors(measurements: Measurements, worlds: Mapping[str, str], usual: str) -> Table:
+    rises = len(worlds) > 2
+    body = []
+    for row in _rows(measurements):
+        cells = [shown(middle(measurements, row, world, "error")) for world in worlds.values()]
+        rise = _rise(measurements, row, worlds, usual)
+        body.append([title_of(row), *cells, *([rise] if rises else [])])
+    caption = (
+        "Error against the expert's action, m²/s²: interquartile mean over seeds and flights with its 95 % interval."
+    )
+    if rises:
+        caption += " Rise: mean over the other worlds, minus the error in the world of training."
+    best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(worlds) + rises), "low")
+    header = ["model", *worlds, *(["rise"] if rises else [])]
+    return Table("Errors", header, body, f"{caption} {_flown(measurements)}", best, REFERENCES)
+
+
+def _rise(measurements: Measurements, row: Subject | str, worlds: Mapping[str, str], usual: str) -> float:
+    found = {world: middle(measurements, row, world, "error") for world in {*worlds.values(), usual}}
+    values = {world: np.nan if interval is None else interval.value for world, interval in found.items()}
+    return float(np.mean([value for world, value in values.items() if world != usual]) - values[usual])
+
+
+def _flown(measurements: Measurements) -> str:
+    flown = {(world.flocks, world.steps) for world in measurements.study.worlds}
+    flights = sorted({flocks for flocks, _ in flown})
+    span = f"{flights[0]}" if len(flights) == 1 else f"{flights[0]} to {flights[-1]}"
+    return f"{span} flights of {measurements.study.worlds[0].steps} steps from the same starts for all rows."
+
+
+def _lost(measurements: Measurements, worlds: Mapping[str, str]) -> Table:
+    flown = {heading: world for heading, world in worlds.items() if world != VALIDATION}
+    body = []
+    for row in _rows(measurements):
+        shares = [measurements.values(row, world, "lost") for world in flown.values()]
+        body.append([title_of(row), *("failed" if share is None else f"{share.mean():.0%}" for share in shares)])
+    best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(flown)), "low")
+    return Table("Share of flocks that lost their leader", ["model", *flown], body, "At the end.", best, REFERENCES)
+
+
+def _answer(measurements: Measurements, worlds: Mapping[str, str], usual: str) -> str:
+    """The best rows in words."""
+    subjects = measurements.study.subjects
+    errors = {title_of(row): middle(measurements, row, usual, "error") for row in subjects}
+    known = {title: interval.value for title, interval in errors.items() if interval is not None}
+    if not known:
+        return "Nothing could be measured."
+    text = f"Lowest error in the world of training: {min(known, key=known.__getitem__)}."
+    rises = {title_of(row): _rise(measurements, row, worlds, usual) for row in subjects}
+    if len(worlds) > 2 and (finite := {title: rise for title, rise in rises.items() if np.isfinite(rise)}):
+        least = min(finite, key=finite.__getitem__)
+        sums = {title: rise + known[title] for title, rise in finite.items() if title in known}
+        text += (
+            f" Least rise in the others: {least}. Lowest mean error in the others: {min(sums, key=sums.__getitem__)}."
+        )
+    return text
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One panel of a figure: the worlds along its axis, and how many hops its models have."""
+
+    title: str
+    label: str
+    hops: int
+    worlds: Sequence[tuple[float, str]]
+    log_x: bool = False
+    trained_at: float | None = None
+
+
+def _levels_by_hops(study: Study) -> list[Panel]:
+    is_size = study.worlds[0].name.startswith("size-")
+    label = "agents" if is_size else "communication range, m"
+    at = [(world.num_agents if is_size else world.changes["comm_range"], world.name) for world in study.worlds]
+    return [Panel(f"K = {hops}", label, hops, at, is_size, float(REFERENCE_SIZE) if is_size else 3.5) for hops in HOPS]
+
+
+def _faults_by_kind() -> list[Panel]:
+    return [
+        Panel("K = 1", kind, 1, [(0.0, "study-32"), *((level, _fault_name(change)) for level, change in levels)])
+        for kind, levels in FAULTS.items()
+    ]
+
+
+def _panels(measurements: Measurements, panels: Sequence[Panel]) -> Callable[[Canvas], None]:
+    """Draws one panel beside the other, in each a curve for each model."""
+    models = list(dict.fromkeys(subject.model for subject in measurements.study.subjects))
+    drawn = []
+    for panel in panels:
+        rows: dict[str, Subject | str] = {NAMES[model]: Subject(model, panel.hops) for model in models}
+        rows |= {"LocalReynolds": "LocalReynolds(hops=1)", "zero action": "zero action"}
+        curves = {}
+        for name, row in rows.items():
+            found = [
+                _estimate(measurements, row, world) or Estimate(np.nan, np.nan, np.nan) for _, world in panel.worlds
+            ]
+            curves[name] = Curve(
+                [level for level, _ in panel.worlds],
+                *([getattr(one, at) for one in found] for at in ("value", "low", "high")),
+            )
+        drawn.append((panel, curves))
+
+    def draw(canvas: Canvas) -> None:
+        for part, (panel, curves) in zip(draw_panels(canvas, [panel.title for panel in panels]), drawn, strict=True):
+            marks = {} if panel.trained_at is None else {"trained": panel.trained_at}
+            draw_curves(part, curves, x_label=panel.label, y_label="error, m²/s²", marks=marks, log_x=panel.log_x)
+
+    return draw
