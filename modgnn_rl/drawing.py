@@ -42,7 +42,7 @@ _SLOTS = (
     ("gat", "moment_force"),
     ("mpnn", "pair_force"),
 )
-_THEME: dict[str, Any] = {
+_THEME: Any = {
     "font.size": 9,
     "font.family": "DejaVu Sans",  # comes with matplotlib
     "axes.edgecolor": MUTED,
@@ -135,14 +135,14 @@ def draw(name: str, onto: Callable[[Figure], None]) -> Drawing:
         onto(figure)
         return figure
 
-    with mpl.rc_context({**mpl.rcParamsDefault, **_THEME, "svg.hashsalt": name}):
+    with mpl.rc_context():
+        mpl.rcdefaults()  # whatever the user's own file of settings says
+        mpl.rcParams.update(_THEME | {"svg.hashsalt": name})
         wide, narrow = drawn(WIDE), drawn(NARROW)
-        with mpl.rc_context({"svg.fonttype": "none"}):
-            pages = [
-                _inline(_saved(figure, "svg").decode(), name + end) for figure, end in ((wide, ""), (narrow, "-n"))
-            ]
         svg, png = (_saved(wide, form, facecolor="white") for form in ("svg", "png"))
-    return Drawing(*pages, svg, png)
+        mpl.rcParams["svg.fonttype"] = "none"  # letters stay text, to be searched and read aloud
+        page, phone = (_saved(figure, "svg").decode() for figure in (wide, narrow))
+    return Drawing(_inline(page, f"{name}-wide"), _inline(phone, f"{name}-narrow"), svg, png)
 
 
 def page_colours() -> tuple[str, str]:

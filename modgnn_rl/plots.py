@@ -21,7 +21,7 @@ __all__ = ["Curve", "Estimate", "draw_curves", "draw_intervals", "draw_panels"]
 _MARKERS = "o^sDvP"
 _DASHES = (0, (4, 3))  # of references
 NARROW = 5.0  # inches; narrower figures are for a phone, or panels
-_LINE_HEIGHT = 1.25  # of a label, in its font size
+_LABEL, _LINE_HEIGHT = 7.5, 1.25  # points; in font sizes
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,14 @@ def draw_curves(
         log_y: a logarithmic axis.
     """
     axes = figure.add_subplot(xlabel=x_label, ylabel=y_label)
-    ends = {}
+    ends: dict[str, tuple[float, str, Any]] = {}
     positions = np.unique(np.concatenate([np.asarray(curve.x, float) for curve in curves.values()] or [np.zeros(0)]))
     few = len(positions) <= 12
     for name, style in styles_of(curves).items():
         x, y = np.asarray(curves[name].x, float), np.asarray(curves[name].y, float)
-        marker = {"marker": style.marker, "markeredgecolor": PAPER, "markeredgewidth": 0.8} if few else {}
+        marker: dict[str, Any] = (
+            {"marker": style.marker, "markeredgecolor": PAPER, "markeredgewidth": 0.8} if few else {}
+        )
         axes.plot(x, y, color=style.colour, linestyle=style.line, **marker)
         low, high = curves[name].low, curves[name].high
         if low is not None and high is not None:
@@ -192,14 +194,14 @@ def _mark(axes: Axes, positions: Mapping[str, float]) -> None:
             "xytext": (0, 3),
             "textcoords": "offset points",
         }
-        texts.append(axes.annotate(name, **at, ha="center", va="bottom", color=MUTED, fontsize="small"))
+        texts.append(axes.annotate(name, **at, ha="center", va="bottom", color=MUTED, fontsize=_LABEL))
     axes.figure.canvas.figure.draw_without_rendering()
     taken: list[float] = []  # right end of each level, pixels
     for text in sorted(texts, key=lambda text: text.xy[0]):
         box = text.get_window_extent()
         level = next((level for level, end in enumerate(taken) if end + 4 < box.x0), len(taken))
         taken[level : level + 1] = [box.x1]
-        text.xyann = (0, 3 + level * text.get_fontsize() * _LINE_HEIGHT)
+        text.xyann = (0, 3 + level * _LABEL * _LINE_HEIGHT)
 
 
 def _label_ends(axes: Axes, ends: Mapping[str, tuple[float, str, Any]]) -> None:
@@ -214,13 +216,12 @@ def _label_ends(axes: Axes, ends: Mapping[str, tuple[float, str, Any]]) -> None:
             "textcoords": "offset points",
         }
         tie = {"arrowstyle": "-", "color": colour, "linestyle": line, "shrinkA": 0, "shrinkB": 0, "relpos": (0, 0.5)}
-        texts[name] = axes.annotate(name, **at, va="center", color=ink, fontsize="small", arrowprops=tie)
+        texts[name] = axes.annotate(name, **at, va="center", color=ink, fontsize=_LABEL, arrowprops=tie)
     axes.figure.canvas.figure.draw_without_rendering()  # sets the limits, and leaves room for the names
     height = axes.get_window_extent().height / axes.figure.dpi * 72  # points
     to_points = axes.transData + axes.transAxes.inverted()
     heights = {name: height * float(np.clip(to_points.transform((1, y))[1], 0, 1)) for name, (y, *_) in ends.items()}
-    size = max((text.get_fontsize() for text in texts.values()), default=0.0) * _LINE_HEIGHT
-    for name, moved in zip(heights, _kept_apart(list(heights.values()), size, height), strict=True):
+    for name, moved in zip(heights, _kept_apart(list(heights.values()), _LABEL * _LINE_HEIGHT, height), strict=True):
         texts[name].xy = (1, heights[name] / height)
         texts[name].xyann = (12, moved - heights[name])
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from modgnn_rl.errors import InputError
 from modgnn_rl.tabular import Table, as_csv, as_latex, as_markdown, first_number, latex_escape, numeric_columns
 
-ROWS = [
+ROWS: list[list[str | float]] = [
     ["expert", "-", 0.0, "3.55 ± 3.96"],
     ["modgnn_mlp", 1, 0.19712, "3.9 ± 2.1 [3.7, 4.1]"],
     ["gcn|final", 2, 0.1971, "-"],
