@@ -208,11 +208,11 @@ def _rows(measurements: Measurements) -> list[Subject | str]:
 
 def _errors(measurements: Measurements, worlds: Mapping[str, str], usual: str) -> Table:
     rises = len(worlds) > 2
-    body = []
+    body: list[list[str | float]] = []
     for row in _rows(measurements):
-        cells = [shown(middle(measurements, row, world, "error")) for world in worlds.values()]
-        rise = _rise(measurements, row, worlds, usual)
-        body.append([title_of(row), *cells, *([rise] if rises else [])])
+        cells: list[str | float] = [shown(middle(measurements, row, world, "error")) for world in worlds.values()]
+        cells += [_rise(measurements, row, worlds, usual)] if rises else []
+        body.append([title_of(row), *cells])
     caption = (
         "Error against the expert's action, m²/s²: interquartile mean over seeds and flights with its 95 % interval."
     )
@@ -285,7 +285,12 @@ def _levels_by_hops(study: Study) -> list[Panel]:
 
 def _faults_by_kind() -> list[Panel]:
     return [
-        Panel("K = 1", kind, 1, [(0.0, "study-32"), *((level, _fault_name(change)) for level, change in levels)])
+        Panel(
+            kind.split(",")[0],
+            f"{kind} (K = 1)",
+            1,
+            [(0.0, "study-32"), *((level, _fault_name(change)) for level, change in levels)],
+        )
         for kind, levels in FAULTS.items()
     ]
 
