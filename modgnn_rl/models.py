@@ -150,7 +150,7 @@ def modgnn_mlp(spec: LayerSpec) -> ModGNNLayer:
 def modgnn_adjacency(spec: LayerSpec) -> ModGNNLayer:
     """ModGNN-MLP whose f_com is the adjacency: sums of the neighbours' data, not of differences, as in a plain GCN."""
     layer = modgnn_mlp(spec)
-    layer.f_com = Adjacency()
+    layer.f_com = nn.ModuleList([Adjacency() for _ in range(spec.hops)])
     return layer
 
 

@@ -6,7 +6,6 @@ average over them first.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -137,12 +136,10 @@ def interquartile_interval(
         InputError: no values, a NaN, or a setting out of range.
     """
     data = _checked_matrix(values)
-
-    def resample() -> NDArray[np.float64]:
-        seeds, flights = data.shape
-        return data[rng.integers(seeds, size=(seeds, 1)), rng.integers(flights, size=data.shape)].ravel()
-
-    return _interval(_middle_mean(data.ravel()), lambda: _middle_mean(resample()), confidence, resamples)
+    lot = _Lot(rng, resamples, confidence)
+    seeds, flights = data.shape
+    drawn = data[lot.draw(seeds, (seeds, 1)), lot.draw(flights, data.shape)].reshape(resamples, -1)
+    return lot.interval(float(_middle_mean(data.reshape(1, -1))[0]), _middle_mean(drawn))
 
 
 def probability_of_improvement(
@@ -174,34 +171,50 @@ def probability_of_improvement(
     if paired and x.shape[1] != y.shape[1]:
         raise InputError(f"{x.shape[1]} and {y.shape[1]} flights cannot be paired; give values of the same flights")
     if paired:
-        a, b = x[:, None], y[None]  # [S, T, F]
+        a, b, axes = x[:, None], y[None], "stf,rs,rt,rf->r"
     else:
-        a, b = x[:, None, :, None], y[None, :, None, :]  # [S, T, F, G]
+        a, b, axes = x[:, None, :, None], y[None, :, None, :], "stfg,rs,rt,rf,rg->r"
     wins = (a < b) + (a == b) / 2
-
-    def resample() -> float:
-        lots = [rng.integers(length, size=length) for length in wins.shape]
-        return float(wins[np.ix_(*lots)].mean())
-
-    return _interval(float(wins.mean()), resample, confidence, resamples)
+    lot = _Lot(rng, resamples, confidence)
+    shares = [lot.shares(length) for length in wins.shape]
+    return lot.interval(float(wins.mean()), np.einsum(axes, wins, *shares, optimize=True))
 
 
-def _interval(value: float, resample: Callable[[], float], confidence: float, resamples: int) -> Interval:
-    """Return the percentile bootstrap interval of a figure."""
-    if not 0 < confidence < 1 or resamples < 1:
-        raise InputError(
-            f"confidence={confidence}, resamples={resamples}: give a confidence between 0 and 1 and resamples >= 1"
-        )
-    drawn = [resample() for _ in range(resamples)]
-    tail = (1 - confidence) / 2
-    # A sample, not a mean of two: one of them may be infinite.
-    low, high = np.quantile(drawn, [tail, 1 - tail], method="nearest")
-    return Interval(value, float(low), float(high))
+@dataclass(frozen=True)
+class _Lot:
+    """Bootstrap samples, all drawn at once."""
+
+    rng: np.random.Generator
+    resamples: int
+    confidence: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.confidence < 1 or self.resamples < 1:
+            raise InputError(
+                f"confidence={self.confidence}, resamples={self.resamples}: give a confidence between 0 and 1 and "
+                "resamples >= 1"
+            )
+
+    def draw(self, length: int, shape: tuple[int, ...]) -> NDArray[np.int64]:
+        """Indices below ``length`` for each resample."""
+        return self.rng.integers(length, size=(self.resamples, *shape))
+
+    def shares(self, length: int) -> NDArray[np.float64]:
+        """How often each of ``length`` is drawn in each resample, in shares [R, length]."""
+        return self.rng.multinomial(length, np.full(length, 1 / length), size=self.resamples) / length
+
+    def interval(self, value: float, drawn: NDArray[np.float64]) -> Interval:
+        """Return a figure with the percentiles of its resamples [R]."""
+        tail = (1 - self.confidence) / 2
+        # Each end is a resample, not a mean of two: one of them may be infinite.
+        low, high = np.quantile(drawn, [tail, 1 - tail], method="nearest")
+        return Interval(value, float(low), float(high))
 
 
-def _middle_mean(data: NDArray[np.float64]) -> float:
-    cut = data.size // 4
-    return float(np.sort(data)[cut : data.size - cut].mean())
+def _middle_mean(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Interquartile mean of each row [R, n] -> [R]."""
+    cut = rows.shape[1] // 4
+    return np.asarray(np.sort(rows, axis=1)[:, cut : rows.shape[1] - cut].mean(1))
 
 
 def _checked_matrix(values: ArrayLike) -> NDArray[np.float64]:
