@@ -24,7 +24,7 @@ NAMES = {
     "gcn": "GCN",
     "gcn_final": "GCN [+f_final]",
     "central": "Central",
-    "modgnn_adjacency": "adjacency",
+    "modgnn_adjacency": "ModGNN-MLP, adjacency",
     "gat": "attention",
     "mpnn": "message passing",
 }
@@ -83,7 +83,9 @@ def _mean(measurements: Measurements, row: Row, world: str, figure: str) -> floa
 def _about(measurements: Measurements, world: str) -> str:
     """How many flights a table rests on."""
     seeds = measurements.config.seeds
-    counted = f"{seeds} training{'s' if seeds > 1 else ''} of each model"
+    counted = (
+        f"{seeds} trainings of each model" if seeds > 1 else "one training of each model, so intervals tell of flights"
+    )
     if world == VALIDATION:
         return f"{measurements.config.scale.held_out} flights of the expert that no model was trained on; {counted}."
     flown = next(entry for entry in measurements.study.worlds if entry.name == world)

@@ -121,8 +121,8 @@ def cells_of(config: ReproduceConfig, study: Study, folder: Path) -> list[Cell]:
 
 
 def _flight_cost(world: World) -> float:
-    """Seconds, roughly: steps have a cost of their own, pairs of agents another."""
-    return world.steps * (0.01 + world.flocks * 3e-4 * (world.num_agents / 32) ** 1.7)
+    """Seconds, roughly: a flight, a step and a pair of agents have costs of their own."""
+    return 0.5 + world.steps * (0.015 + world.flocks * 5e-4 * (world.num_agents / 32) ** 1.7)
 
 
 def _groups(study: Study) -> list[list[Subject]]:
@@ -164,7 +164,8 @@ def _cloning_cell(config: ReproduceConfig, study: Study, group: list[Subject], s
         model=ModelConfig(first.model, first.hops, first.layers, first.hidden),
         trainer=trainer,
     )
-    cost = study.updates * scale.batch_size * 1e-4 * sum(subject.hops for subject in group)
+    links = scale.batch_size * sum(subject.hops * (subject.layers or 1) for subject in group)
+    cost = 3.0 + study.updates * (0.01 * len(group) + 3e-4 * links)  # seconds, roughly
     return Cell(name, functools.partial(_train, training, group, folder), cost, ("dataset",))
 
 
@@ -172,7 +173,12 @@ def _stages_after(config: ReproduceConfig, study: Study, subject: Subject, seed:
     """DAgger from the cloned policy, and MAPPO from that, as far as asked for."""
     scale = config.scale
     dagger = DAggerConfig(
-        rounds=scale.rounds, num_envs=scale.num_envs, cloning_updates=0, batch_size=scale.batch_size, rotate=False
+        rounds=scale.rounds,
+        num_envs=scale.num_envs,
+        cloning_steps=min(200, scale.steps),
+        cloning_updates=0,
+        batch_size=scale.batch_size,
+        rotate=False,
     )
     mappo = MAPPOConfig(
         iterations=scale.iterations, num_envs=scale.num_envs, critic_warmup=min(10, scale.iterations // 4)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import bisect
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig, ScaleConfi
 from modgnn_rl.files import write_atomically
 from modgnn_rl.models import make_model
 from modgnn_rl.paper_tables import NAMES, REFERENCES, middle, paper_tables, shown, title_of
-from modgnn_rl.plots import Curve, Estimate, draw_curves, draw_intervals, draw_panels
+from modgnn_rl.plots import Curve, Estimate, draw_curves, draw_intervals
 from modgnn_rl.report import Details, Figure, Section, gather_provenance, write_report
 from modgnn_rl.reproducing import VALIDATION, Measurements, Study, Subject, World
 from modgnn_rl.tabular import Table, as_csv, as_latex, as_markdown
@@ -108,7 +108,8 @@ def equal_hidden(model: str, layers: int, hops: int) -> int:
         return sum(weights.numel() for weights in make_model(model, hops, hidden, layers=layers, seed=0).parameters())
 
     wanted = parameters("modgnn_mlp", 1, 32, 1)
-    return min(range(4, 80), key=lambda hidden: abs(parameters(model, hops, hidden, layers) - wanted))
+    wider = bisect.bisect(range(1, 256), wanted, key=lambda hidden: parameters(model, hops, hidden, layers)) + 1
+    return min((max(1, wider - 1), wider), key=lambda hidden: abs(parameters(model, hops, hidden, layers) - wanted))
 
 
 def write_study(measurements: Measurements, folder: Path) -> Path:
@@ -180,15 +181,14 @@ def _studied(measurements: Measurements) -> tuple[dict[str, Table], list[Figure]
     config, study = measurements.config, measurements.study
     name = config.study
     if name in ("communication", "layers"):
-        figure = Figure(name, _by_hops(measurements, "study-32"), "Error on flights of the models' own, m²/s².")
+        figures = [Figure(name, _by_hops(measurements, "study-32"), "Error on flights of the models' own, m²/s².")]
         worlds = {"expert's flights": VALIDATION, "own flights": "study-32"}
     else:
-        panels = _faults_by_kind() if name == "faults" else _levels_by_hops(study)
-        figure = Figure(name, _panels(measurements, panels), "Error over the level, with 95 % bands, m²/s².")
+        figures = (_curves_by_fault if name == "faults" else _curves_by_hops)(measurements)
         worlds = {_heading(world): world.name for world in study.worlds}
     usual = next(world.name for world in study.worlds if _is_usual(config, world))
     tables = {"errors": _errors(measurements, worlds, usual), "lost": _lost(measurements, worlds)}
-    return tables, [figure], _answer(measurements, worlds, usual)
+    return tables, figures, _answer(measurements, worlds, usual)
 
 
 def _is_usual(config: ReproduceConfig, world: World) -> bool:
@@ -261,61 +261,51 @@ def _answer(measurements: Measurements, worlds: Mapping[str, str], usual: str) -
         text += (
             f" Least rise in the others: {least}. Lowest mean error in the others: {min(sums, key=sums.__getitem__)}."
         )
-    return text
+    return f"{text} ModGNN-MLP's f_com is the Laplacian." if measurements.config.study == "communication" else text
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One panel of a figure: the worlds along its axis, and how many hops its models have."""
-
-    title: str
-    label: str
-    hops: int
-    worlds: Sequence[tuple[float, str]]
-    log_x: bool = False
-    trained_at: float | None = None
-
-
-def _levels_by_hops(study: Study) -> list[Panel]:
-    is_size = study.worlds[0].name.startswith("size-")
+def _curves_by_hops(measurements: Measurements) -> list[Figure]:
+    """A figure for each K: errors over the communication range, or over the number of agents."""
+    study, is_size = measurements.study, measurements.config.study == "size"
     label = "agents" if is_size else "communication range, m"
     at = [(world.num_agents if is_size else world.changes["comm_range"], world.name) for world in study.worlds]
-    return [Panel(f"K = {hops}", label, hops, at, is_size, float(REFERENCE_SIZE) if is_size else 3.5) for hops in HOPS]
-
-
-def _faults_by_kind() -> list[Panel]:
+    marks = {"trained": float(REFERENCE_SIZE) if is_size else measurements.config.env.comm_range}
     return [
-        Panel(
-            kind.split(",")[0],
-            f"{kind} (K = 1)",
-            1,
-            [(0.0, "study-32"), *((level, _fault_name(change)) for level, change in levels)],
+        Figure(
+            f"{measurements.config.study}_K{hops}",
+            functools.partial(
+                draw_curves,
+                curves=_curves(measurements, hops, at),
+                x_label=label,
+                y_label="error, m²/s²",
+                marks=marks,
+                log_x=is_size,
+            ),
+            f"Error on flights of the models' own over {label}, K = {hops}; bands are 95 % intervals.",
         )
-        for kind, levels in FAULTS.items()
+        for hops in HOPS
     ]
 
 
-def _panels(measurements: Measurements, panels: Sequence[Panel]) -> Callable[[Canvas], None]:
-    """Draws one panel beside the other, in each a curve for each model."""
+def _curves_by_fault(measurements: Measurements) -> list[Figure]:
+    """A figure for each fault: errors of the models with K = 1 over its strength."""
+    figures = []
+    for kind, levels in FAULTS.items():
+        at = [(0.0, "study-32"), *((level, _fault_name(change)) for level, change in levels)]
+        draw = functools.partial(draw_curves, curves=_curves(measurements, 1, at), x_label=kind, y_label="error, m²/s²")
+        caption = f"Error on flights of the models' own over {kind}, K = 1; bands are 95 % intervals."
+        figures.append(Figure(f"faults_{next(iter(levels[0][1]))}", draw, caption))
+    return figures
+
+
+def _curves(measurements: Measurements, hops: int, at: Sequence[tuple[float, str]]) -> dict[str, Curve]:
+    """A curve for each model and two references, over levels with the names of their worlds."""
     models = list(dict.fromkeys(subject.model for subject in measurements.study.subjects))
-    drawn = []
-    for panel in panels:
-        rows: dict[str, Subject | str] = {NAMES[model]: Subject(model, panel.hops) for model in models}
-        rows |= {"LocalReynolds": "LocalReynolds(hops=1)", "zero action": "zero action"}
-        curves = {}
-        for name, row in rows.items():
-            found = [
-                _estimate(measurements, row, world) or Estimate(np.nan, np.nan, np.nan) for _, world in panel.worlds
-            ]
-            curves[name] = Curve(
-                [level for level, _ in panel.worlds],
-                *([getattr(one, at) for one in found] for at in ("value", "low", "high")),
-            )
-        drawn.append((panel, curves))
-
-    def draw(canvas: Canvas) -> None:
-        for part, (panel, curves) in zip(draw_panels(canvas, [panel.title for panel in panels]), drawn, strict=True):
-            marks = {} if panel.trained_at is None else {"trained": panel.trained_at}
-            draw_curves(part, curves, x_label=panel.label, y_label="error, m²/s²", marks=marks, log_x=panel.log_x)
-
-    return draw
+    rows: dict[str, Subject | str] = {NAMES[model]: Subject(model, hops) for model in models}
+    rows |= {"LocalReynolds": "LocalReynolds(hops=1)", "zero action": "zero action"}
+    curves, unknown = {}, Estimate(np.nan, np.nan, np.nan)
+    for name, row in rows.items():
+        found = [_estimate(measurements, row, world) or unknown for _, world in at]
+        value, low, high = ([getattr(one, end) for one in found] for end in ("value", "low", "high"))
+        curves[name] = Curve([level for level, _ in at], value, low, high)
+    return curves
