@@ -485,7 +485,7 @@ class ScaleConfig:
     episodes: int = setting(200, "flights of the expert to train on", low=1)
     steps: int = setting(500, "steps of each", low=2)
     held_out: int = setting(32, "further flights of the expert, for the validation error", low=1)
-    updates: int = setting(4000, "updates of each cloned model", low=1)
+    updates: int = setting(6000, "updates of each cloned model", low=1)
     batch_size: int = setting(64, "flock states in a batch", low=1)
     flocks: int = setting(32, "fresh flocks that each policy flies", low=2)
     flight_steps: int = setting(1000, "steps of a flight", low=4)
@@ -493,7 +493,7 @@ class ScaleConfig:
     rounds: int = setting(40, "after=dagger or mappo: rounds of DAgger", low=1)
     iterations: int = setting(15, "after=mappo: rounds of MAPPO", low=1)
     num_envs: int = setting(16, "after=dagger or mappo: flocks flown at once", low=1)
-    study_updates: int = setting(1500, "study=communication or layers: updates of each model", low=1)
+    study_updates: int = setting(4000, "study=communication or layers: updates of each model", low=1)
     study_flocks: int = setting(16, "study=...: fresh flocks that each policy flies, of 32 agents or fewer", low=2)
     study_steps: int = setting(400, "study=...: steps of a flight", low=4)
     study_sizes: list[int] = setting(

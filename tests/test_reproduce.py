@@ -192,7 +192,7 @@ def test_a_folder_keeps_to_its_settings(tmp_path):
     config = ReproduceConfig(folder=folder, env=FlockingConfig(leader_max_speed=math.inf))
     assert claim_folder(config) == claim_folder(dataclasses.replace(config, seeds=5, study="range", after="dagger"))
     changed = dataclasses.replace(config, scale=dataclasses.replace(config.scale, updates=7))
-    with pytest.raises(InputError, match=r"was begun with scale.updates=4000"):
+    with pytest.raises(InputError, match=r"was begun with scale.updates=6000"):
         claim_folder(changed)
     (tmp_path / "one" / "settings.json").write_text("{")
     with pytest.raises(InputError, match="damaged"):

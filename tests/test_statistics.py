@@ -136,7 +136,9 @@ def test_one_infinite_flight_does_not_move_the_middle() -> None:
         ([[0.0], [np.inf]], [[np.inf]], 0.75),
     ],
 )
-def test_probability_of_improvement_by_hand(better: object, worse: object, expected: float) -> None:
+def test_probability_of_improvement_by_hand(
+    better: list[list[float]], worse: list[list[float]], expected: float
+) -> None:
     found = probability_of_improvement(better, worse, rng=rng(), resamples=50)
     assert found.value == expected
     assert found.low <= found.value <= found.high
