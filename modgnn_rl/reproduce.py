@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,15 @@ def main(config: ReproduceConfig) -> int:
 
     prepare_torch(config.device, config.threads)
     study = study_of(config)
-    outcome = run_cells(folder / "cells", cells_of(config, study, folder))
-    page = write_study(Measurements(outcome, config, study), folder)
+    started = datetime.now().astimezone()
+    try:
+        outcome = run_cells(folder / "cells", cells_of(config, study, folder))
+    except KeyboardInterrupt:
+        print(
+            f"Stopped; what is finished is kept in {folder}, and the same command goes on from there", file=sys.stderr
+        )
+        raise
+    page = write_study(Measurements(outcome, config, study), folder, started)
     print(f"The tables are in {page.with_name('tables.md')}, the report is {page}")
     for name, reason in outcome.failures.items():
         print(f"failed: {name}: {reason}", file=sys.stderr)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,8 +113,13 @@ def equal_hidden(model: str, layers: int, hops: int) -> int:
     return min((max(1, wider - 1), wider), key=lambda hidden: abs(parameters(model, hops, hidden, layers) - wanted))
 
 
-def write_study(measurements: Measurements, folder: Path) -> Path:
+def write_study(measurements: Measurements, folder: Path, started: datetime | None = None) -> Path:
     """Write the tables of a study, each as CSV and LaTeX and all on one page, and the report.
+
+    Args:
+        measurements: what was measured.
+        folder: of the reproduction; the study has a folder of its own in it.
+        started: when this command began, with a time zone.
 
     Returns:
         the path of ``report.html``; ``tables.md`` is beside it.
@@ -137,7 +143,7 @@ def write_study(measurements: Measurements, folder: Path) -> Path:
         Section("Settings", "", [Details("all settings", _yaml(config)), Details("time of each cell", times)]),
     ]
     spent = {"all cells": f"{sum(outcome.seconds.values()) / 60:.1f} min on one process"}
-    return write_report(place, title, sections, gather_provenance(times=spent))
+    return write_report(place, title, sections, gather_provenance(started=started, times=spent))
 
 
 def _yaml(config: ReproduceConfig) -> str:
