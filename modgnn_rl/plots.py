@@ -164,12 +164,11 @@ def draw_intervals(
 
 
 def draw_panels(figure: Figure, titles: Sequence[str]) -> list[Figure]:
-    """Divide a figure into panels, each to be drawn into as a figure: side by side, or stacked where it is narrow."""
-    wide = figure.get_figwidth() >= NARROW
-    if not wide:
-        figure.set_figheight(2.8 * len(titles))
-    shape = (1, len(titles)) if wide else (len(titles), 1)
-    panels: list[Figure] = list(figure.subfigures(*shape, squeeze=False).flat)
+    """Divide a figure into panels, each to be drawn into as a figure: two in a row, or one where it is narrow."""
+    columns = 1 if figure.get_figwidth() < NARROW else min(2, len(titles))
+    rows = -(-len(titles) // columns)
+    figure.set_figheight(max(3.0 * rows, figure.get_figheight()))
+    panels: list[Figure] = list(figure.subfigures(rows, columns, squeeze=False).flat)[: len(titles)]
     for panel, title in zip(panels, titles, strict=True):
         panel.suptitle(title, fontweight="bold", fontsize="medium", x=0.02, ha="left")
     return panels
