@@ -82,7 +82,8 @@ def draw_curves(
         curves: by name; a model always has the same colour, see `modgnn_rl.drawing.styles_of`.
         x_label: with its unit.
         y_label: with its unit.
-        references: heights of horizontal lines by name, such as ``{"expert": 0.0}``.
+        references: heights of horizontal lines by name, such as ``{"expert": 0.0}``; a logarithmic axis leaves out what
+            is not above zero.
         marks: positions of vertical lines by name, such as ``{"trained with": 32}``.
         log_x: powers of two on the axis.
         log_y: a logarithmic axis.
@@ -112,10 +113,10 @@ def draw_curves(
         every = 2 if len(positions) > 6 and figure.bbox.width / figure.dpi < NARROW else 1
         axes.set_xticks(positions, [f"{x:,.4g}" if at % every == 0 else "" for at, x in enumerate(positions)])
         axes.xaxis.minorticks_off()
-    for name, height in (references or {}).items():
+    for name, height in _within_reach(references, log_y).items():
         axes.axhline(height, color=MUTED, linestyle=_DASHES, linewidth=1, zorder=1)
         ends[name] = (height, MUTED, _DASHES)
-    _mark(axes, marks or {})
+    _mark(axes, _within_reach(marks, log_x))
     _label_ends(axes, ends)
 
 
@@ -150,25 +151,24 @@ def draw_intervals(
             axes.plot(estimate.value, height, marker, color=colour, markersize=6)
     axes.set_yticks(range(len(names)), names, color=INK)
     axes.tick_params("y", length=0)
-    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_ylim(max(len(names), 1) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
     if log_x:
         axes.set_xscale("log")
         _plain_logarithmic(axes.xaxis)
     if hasattr(figure, "set_figheight"):  # a panel has the height of its figure
         figure.set_figheight(1.1 + len(names) * max(0.3, 0.16 * len(groups)))
-    _mark(axes, references or {})
+    _mark(axes, _within_reach(references, log_x))
     if len(groups) > 1:
         _legend_of_markers(axes, list(groups))
 
 
 def draw_panels(figure: Figure, titles: Sequence[str]) -> list[Figure]:
-    """Divide a figure into panels, each to be drawn into as a figure: side by side, or stacked where it is narrow."""
-    wide = figure.get_figwidth() >= NARROW
-    if not wide:
-        figure.set_figheight(2.8 * len(titles))
-    shape = (1, len(titles)) if wide else (len(titles), 1)
-    panels: list[Figure] = list(figure.subfigures(*shape, squeeze=False).flat)
+    """Divide a figure into panels, each to be drawn into as a figure: two in a row, or one where it is narrow."""
+    columns = 1 if figure.get_figwidth() < NARROW else min(2, len(titles))
+    rows = -(-len(titles) // columns)
+    figure.set_figheight(max(3.0 * rows, figure.get_figheight()))
+    panels: list[Figure] = list(figure.subfigures(rows, columns, squeeze=False).flat)[: len(titles)]
     for panel, title in zip(panels, titles, strict=True):
         panel.suptitle(title, fontweight="bold", fontsize="medium", x=0.02, ha="left")
     return panels
@@ -180,7 +180,20 @@ def _legend_of_markers(axes: Axes, names: Sequence[str]) -> None:
     handles = [
         Line2D([], [], color=INK, marker=_MARKERS[number % len(_MARKERS)], linestyle="") for number in range(len(names))
     ]
-    axes.figure.legend(handles, names, loc="outside upper left", ncols=len(names), handletextpad=0.2, columnspacing=1.2)
+    columns = 3 if axes.figure.bbox.width / axes.figure.dpi < NARROW else 6
+    axes.figure.legend(
+        handles,
+        names,
+        loc="outside lower left" if axes.figure.get_suptitle() else "outside upper left",
+        ncols=columns,
+        handletextpad=0.2,
+        columnspacing=1.2,
+    )
+
+
+def _within_reach(lines: Mapping[str, float] | None, logarithmic: bool) -> dict[str, float]:
+    """The lines that an axis can show: a logarithmic one has no zero."""
+    return {name: at for name, at in (lines or {}).items() if np.isfinite(at) and (at > 0 or not logarithmic)}
 
 
 def _mark(axes: Axes, positions: Mapping[str, float]) -> None:
@@ -243,6 +256,7 @@ def _plain_logarithmic(axis: Axis) -> None:
     """Plain numbers on a logarithmic axis: 0.1, 0.2, 0.5, 1."""
     from matplotlib.ticker import LogLocator, NullLocator
 
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,)))
     axis.set_major_formatter(lambda value, _: f"{value:,.4g}")
     axis.set_minor_locator(NullLocator())

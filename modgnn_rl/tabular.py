@@ -95,7 +95,9 @@ def as_markdown(table: Table) -> str:
 def as_csv(table: Table) -> str:
     """The table as CSV: the header and the rows, numbers with all their digits, nothing marked."""
     file = io.StringIO()
-    csv.writer(file, lineterminator="\n").writerows([table.header, *table.rows])
+    # The writer quotes a carriage return only where lines end in one.
+    rows = [[cell.replace("\r", " ") if isinstance(cell, str) else cell for cell in row] for row in table.rows]
+    csv.writer(file, lineterminator="\n").writerows([table.header, *rows])
     return file.getvalue()
 
 
