@@ -171,7 +171,7 @@ def claim_tables(measurements: Measurements) -> dict[str, Table]:
         held, reversed_ = (sum(verdict.word == kind for verdict in verdicts) for kind in ("holds", "reversed"))
         known = [verdict.chance for verdict in verdicts if verdict.chance is not None]
         weakest = shown(min(known, key=lambda chance: chance.value), 2) if known else "-"
-        rows.append([claim.text, word, f"{held} of {len(verdicts)}", reversed_, weakest])
+        rows.append([f"{number}. {claim.text}", word, f"{held} of {len(verdicts)}", reversed_, weakest])
         for verdict in verdicts:
             means = [f"{mean:.3f}" for mean in verdict.means] if verdict.means else ["-", "-"]
             chance = "-" if verdict.chance is None else shown(verdict.chance, 2)

@@ -1,7 +1,8 @@
 """The models: configurations of ModGNN's submodules, by name.
 
 All of them act on observations (position, velocity) [*B, N, 6] with one head, the projection onto the action ball, and
-none of them sees an absolute position: hop 0 reads the agent's velocity, the other hops differences.
+none of them sees an absolute position: hop 0 reads the agent's velocity, the other hops differences. The exception is
+``modgnn_adjacency``, there for comparison, whose communication forms no differences.
 
 With several layers, each but the last puts out features that the next ones communicate beside the observation.
 """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -130,7 +130,9 @@ def write_study(measurements: Measurements, folder: Path, started: datetime | No
     tables, figures, text = _tabled(measurements) if config.study == "tables" else _studied(measurements)
     failed = "\n\n".join(f"Failed: {name}: {reason}." for name, reason in outcome.failures.items())
     title = f"{QUESTIONS[config.study]} ({config.scale.name}, {config.seeds} seed{'s' if config.seeds > 1 else ''})"
-    about = " ".join([f"Policies made by {STAGES[config.after]}.", text])
+    about = f"Policies made by {STAGES[config.after]}. {text}"
+    if config.scale.name == "smoke":
+        about += " At this scale hardly anything is learned: it shows that everything runs."
     for name, table in tables.items():
         write_atomically(place / f"{name}.csv", as_csv(table))
         write_atomically(place / f"{name}.tex", as_latex(table))
@@ -193,8 +195,17 @@ def _studied(measurements: Measurements) -> tuple[dict[str, Table], list[Figure]
         figures = (_curves_by_fault if name == "faults" else _curves_by_hops)(measurements)
         worlds = {_heading(world): world.name for world in study.worlds}
     usual = next(world.name for world in study.worlds if _is_usual(config, world))
-    tables = {"errors": _errors(measurements, worlds, usual), "lost": _lost(measurements, worlds)}
-    return tables, figures, _answer(measurements, worlds, usual)
+    tables = {"errors": _errors(measurements, "Errors", worlds, usual)}
+    if name == "faults":
+        tables = {f"errors_{fault}": table for fault, table in _errors_by_fault(measurements, usual)}
+    return {**tables, "lost": _lost(measurements, worlds)}, figures, _answer(measurements, worlds, usual)
+
+
+def _errors_by_fault(measurements: Measurements, usual: str) -> Iterator[tuple[str, Table]]:
+    """A table for each fault, by its setting."""
+    for kind, levels in FAULTS.items():
+        worlds = {"as trained": usual, **{f"{level:g}": _fault_name(change) for level, change in levels}}
+        yield next(iter(levels[0][1])), _errors(measurements, f"Errors by {kind}", worlds, usual)
 
 
 def _is_usual(config: ReproduceConfig, world: World) -> bool:
@@ -212,7 +223,7 @@ def _rows(measurements: Measurements) -> list[Subject | str]:
     return [*REFERENCES, *measurements.study.subjects]
 
 
-def _errors(measurements: Measurements, worlds: Mapping[str, str], usual: str) -> Table:
+def _errors(measurements: Measurements, title: str, worlds: Mapping[str, str], usual: str) -> Table:
     rises = len(worlds) > 2
     body: list[list[str | float]] = []
     for row in _rows(measurements):
@@ -226,7 +237,7 @@ def _errors(measurements: Measurements, worlds: Mapping[str, str], usual: str) -
         caption += " Rise: mean over the other worlds, minus the error in the world of training."
     best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(worlds) + rises), "low")
     header = ["model", *worlds, *(["rise"] if rises else [])]
-    return Table("Errors", header, body, f"{caption} {_flown(measurements)}", best, REFERENCES)
+    return Table(title, header, body, f"{caption} {_flown(measurements)}", best, REFERENCES)
 
 
 def _rise(measurements: Measurements, row: Subject | str, worlds: Mapping[str, str], usual: str) -> float:
@@ -261,12 +272,12 @@ def _answer(measurements: Measurements, worlds: Mapping[str, str], usual: str) -
         return "Nothing could be measured."
     text = f"Lowest error in the world of training: {min(known, key=known.__getitem__)}."
     rises = {title_of(row): _rise(measurements, row, worlds, usual) for row in subjects}
-    if len(worlds) > 2 and (finite := {title: rise for title, rise in rises.items() if np.isfinite(rise)}):
-        least = min(finite, key=finite.__getitem__)
-        sums = {title: rise + known[title] for title, rise in finite.items() if title in known}
-        text += (
-            f" Least rise in the others: {least}. Lowest mean error in the others: {min(sums, key=sums.__getitem__)}."
-        )
+    others = {title: known[title] + rise for title, rise in rises.items() if title in known and np.isfinite(rise)}
+    if len(worlds) > 2 and others:
+        text += f" Lowest mean error in the others: {min(others, key=others.__getitem__)}."
+        idle = middle(measurements, "zero action", usual, "error")
+        able = {title: rises[title] for title in others if idle is not None and known[title] < idle.value}
+        text += f" Least rise, of those better than doing nothing: {min(able, key=able.__getitem__)}." if able else ""
     return f"{text} ModGNN-MLP's f_com is the Laplacian." if measurements.config.study == "communication" else text
 
 

@@ -117,6 +117,15 @@ def test_failed_cells_are_said_in_the_tables(reproduction, tmp_path):
     assert "failed" in row
 
 
+@pytest.mark.parametrize("study", ["tables", "range", "faults"])
+def test_where_all_failed_the_page_says_so(tmp_path, study):
+    config = ReproduceConfig(scale=TINY, study=study)
+    measured = Measurements(Outcome({}, {}, {"dataset": "the disk is full"}), config, study_of(config))
+    page = write_study(measured, tmp_path).with_name("tables.md").read_text()
+    assert "Failed: dataset: the disk is full." in page
+    assert "failed" in page
+
+
 def test_the_papers_figures_are_in_the_package():
     tables = published()
     assert tables["validation_loss"]["gcn"][3] == 0.657
