@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from modgnn_rl.measuring import VALIDATION, Measurements
 from modgnn_rl.paper_tables import NAMES, shown
-from modgnn_rl.reproducing import VALIDATION, Measurements, Subject
 from modgnn_rl.statistics import Interval, probability_of_improvement
+from modgnn_rl.studies import HOPS, Subject
 from modgnn_rl.tabular import Table
 
 __all__ = ["CLAIMS", "Claim", "Side", "claim_tables", "judge"]
 
-HOPS = (1, 2, 3)
 WITH_PRE, WITHOUT_PRE, BASELINES = ("modgnn_mlp", "no_mid"), ("no_pre", "gcn_final"), ("gcn", "gcn_final")
 OTHERS = ("no_mid", "no_pre", "gcn", "gcn_final")
 FIGURES = {

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from modgnn_rl.reproducing import VALIDATION, Measurements, Subject
+from modgnn_rl.measuring import VALIDATION, Measurements
 from modgnn_rl.statistics import Interval, interquartile_interval
+from modgnn_rl.studies import Subject
 from modgnn_rl.tabular import Table
 
 __all__ = ["REFERENCES", "middle", "paper_tables", "published", "shown", "title_of"]

@@ -26,8 +26,10 @@ def main(config: ReproduceConfig) -> int:
         )
     folder = claim_folder(config)
     from modgnn_rl.cells import run_cells
-    from modgnn_rl.reproducing import Measurements, cells_of
-    from modgnn_rl.studies import study_of, write_study
+    from modgnn_rl.measuring import Measurements
+    from modgnn_rl.reproducing import cells_of
+    from modgnn_rl.studies import study_of
+    from modgnn_rl.study_pages import write_study
     from modgnn_rl.training import prepare_torch
 
     prepare_torch(config.device, config.threads)
