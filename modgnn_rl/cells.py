@@ -26,6 +26,7 @@ __all__ = ["Cell", "Outcome", "run_cells"]
 
 Result = dict[str, Any]
 WAIT = 1.0  # s between two looks at what other processes do
+TELLING = 0.03  # share of the work from which on the pace so far tells something
 
 
 @dataclass(frozen=True)
@@ -143,5 +144,6 @@ class _Clock:
 
     def __str__(self) -> str:
         passed = time.monotonic() - self.begun
-        left = f", about {as_span(passed * self.left / self.cost)} left" if self.cost else ""
+        known = self.cost > TELLING * (self.cost + self.left)
+        left = f", about {as_span(passed * self.left / self.cost)} left" if known else ""
         return f"[{self.number + 1}/{self.total}{left}]"
