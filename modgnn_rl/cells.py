@@ -59,6 +59,13 @@ class Outcome:
     results: dict[str, Result] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
+    waiting: set[str] = field(default_factory=set)
+    """Those of the failures that only lack a cell that failed."""
+
+    def failure_lines(self) -> list[str]:
+        """What failed and why, and how many cells could not be done because of that."""
+        lines = [f"{name}: {reason}" for name, reason in self.failures.items() if name not in self.waiting]
+        return [*lines, f"{len(self.waiting)} others need what failed"] if self.waiting else lines
 
 
 def run_cells(folder: Path, cells: Sequence[Cell]) -> Outcome:
@@ -80,6 +87,7 @@ def run_cells(folder: Path, cells: Sequence[Cell]) -> Outcome:
         for cell in list(pending):
             if lost := next((name for name in cell.needs if name in outcome.failures), None):
                 outcome.failures[cell.name] = f"it needs {lost}, which failed"
+                outcome.waiting.add(cell.name)
             elif not all(name in outcome.results for name in cell.needs) or not _attempt(outcome, folder, cell, clock):
                 continue
             moved = True

@@ -44,8 +44,8 @@ def main(config: ReproduceConfig) -> int:
         raise
     page = write_study(Measurements(outcome, config, study), folder, started)
     print(f"The tables are in {page.with_name('tables.md')}, the report is {page}")
-    for name, reason in outcome.failures.items():
-        print(f"failed: {name}: {reason}", file=sys.stderr)
+    for line in outcome.failure_lines():
+        print(f"failed: {line}", file=sys.stderr)
     if outcome.failures:
         print("The same command tries what failed again, and keeps the rest", file=sys.stderr)
     return 1 if outcome.failures else 0

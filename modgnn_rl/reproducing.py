@@ -89,7 +89,6 @@ def _cloning_cell(config: ReproduceConfig, study: Study, group: list[Subject], s
         cloning_steps=4,  # of the flights that it looks at while it trains
         cloning_updates=study.updates,
         batch_size=scale.batch_size,
-        learning_rates=[3e-3, 1e-4, 1e-4],  # down to the last in one cosine, for no stage follows
         rotate=False,  # the paper did not
         on_nonfinite="skip",
     )

@@ -56,7 +56,7 @@ def write_study(measurements: Measurements, folder: Path, started: datetime | No
     place = folder / (config.study if config.after == "cloning" else f"{config.study}-after-{config.after}")
     place.mkdir(parents=True, exist_ok=True)
     tables, figures, text = _tabled(measurements) if config.study == "tables" else _studied(measurements)
-    failed = "\n\n".join(f"Failed: {name}: {reason}." for name, reason in outcome.failures.items())
+    failed = "\n\n".join(f"Failed: {line}." for line in outcome.failure_lines())
     title = f"{QUESTIONS[config.study]} ({config.scale.name}, {config.seeds} seed{'s' if config.seeds > 1 else ''})"
     about = f"Policies made by {STAGES[config.after]}. {text}"
     if config.scale.name == "smoke":

@@ -60,6 +60,7 @@ def test_a_failure_stops_only_what_needs_it_and_is_tried_again(tmp_path, capsys)
         "b": "it needs a, which failed",
         "c": "it needs b, which failed",
     }
+    assert outcome.failure_lines() == ["a: no luck", "2 others need what failed"]
     assert "at all" in (tmp_path / "a.failed.txt").read_text()
     assert "a failed: no luck" in capsys.readouterr().err
     mended = run_cells(tmp_path, [counting(calls, "a", 3), *work[1:]])
