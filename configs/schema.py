@@ -403,7 +403,7 @@ class TrainConfig:
     logger: Any = setting("none", "dashboards to write for beside the plain files, one or a list", choices=LOGGER_NAMES)
     wandb: WandbConfig = field(default_factory=WandbConfig)
     video_rounds: int = setting(
-        20, "logger=tensorboard or wandb: a film of a flight each so many rounds; 0: none", low=0
+        40, "logger=tensorboard or wandb: a film of a flight each so many rounds; 0: none", low=0
     )
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     resume: str | None = setting(
