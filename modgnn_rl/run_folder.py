@@ -147,9 +147,16 @@ class RunFolder:
         except OSError as error:
             raise InputError(f"cannot write into {self.path} ({error.strerror}): make the folder writable") from error
         try:
+            self._tidy()
             yield
         finally:
             lock.release()
+
+    def _tidy(self) -> None:
+        """Remove the half-written files of a process that was killed."""
+        for leftover in [*self.path.glob(".*.tmp"), *self.path.glob("videos/.*.tmp.mp4")]:
+            with contextlib.suppress(OSError):
+                leftover.unlink()
 
     @property
     def is_locked(self) -> bool:
