@@ -119,7 +119,9 @@ def test_failed_cells_are_said_in_the_tables(reproduction, tmp_path):
     assert "failed" in row
 
 
-@pytest.mark.parametrize("study", ["tables", "range", "faults"])
+@pytest.mark.parametrize(
+    "study", ["tables", *(pytest.param(study, marks=pytest.mark.slow) for study in ("range", "faults"))]
+)
 def test_where_all_failed_the_page_says_so(tmp_path, study):
     config = ReproduceConfig(scale=TINY, study=study)
     measured = Measurements(Outcome({}, {}, {"dataset": "the disk is full"}), config, study_of(config))
