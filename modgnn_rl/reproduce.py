@@ -57,7 +57,7 @@ def claim_folder(config: ReproduceConfig) -> Path:
     Raises:
         InputError: it was begun with others, or cannot be written.
     """
-    folder = Path(config.folder or f"reproduction/{config.scale.name}")
+    folder = Path(config.folder or f"reproduction/{config.scale.name}").absolute()
     kept: Any = OmegaConf.to_container(OmegaConf.structured(config))
     mine = flat({name: kept[name] for name in ("env", "scale", "seed")})
     file = folder / "settings.json"

@@ -213,3 +213,9 @@ def test_a_folder_keeps_to_its_settings(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write"):
         claim_folder(dataclasses.replace(config, folder=str(tmp_path / "file" / "below")))
+
+
+def test_a_folder_beside_the_user_is_meant_from_there(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert claim_folder(ReproduceConfig()) == tmp_path / "reproduction" / "small"
+    assert claim_folder(ReproduceConfig(folder="mine")) == tmp_path / "mine"  # runs know themselves by absolute paths
