@@ -153,10 +153,11 @@ class RunFolder:
             lock.release()
 
     def _tidy(self) -> None:
-        """Remove the half-written files of a process that was killed."""
-        for leftover in [*self.path.glob(".*.tmp"), *self.path.glob("videos/.*.tmp.mp4")]:
-            with contextlib.suppress(OSError):
-                leftover.unlink()
+        """Remove what a training that was killed left half-written; others write no such files."""
+        for pattern in (".status.json.*.tmp", ".config.yaml.*.tmp", "videos/.*.tmp.mp4"):
+            for leftover in self.path.glob(pattern):
+                with contextlib.suppress(OSError):
+                    leftover.unlink()
 
     @property
     def is_locked(self) -> bool:

@@ -153,8 +153,10 @@ def test_half_written_files_of_a_killed_process_go_when_the_next_one_begins(tmp_
     run = RunFolder.create(tmp_path, "run", "seed: 0\n")
     (run.path / "videos").mkdir()
     left = [run.path / ".status.json.123.tmp", run.path / "videos" / ".round_00040.123.tmp.mp4"]
-    for file in left:
+    theirs = run.path / ".evaluation.json.124.tmp"  # an evaluation may be at work meanwhile
+    for file in (*left, theirs):
         file.touch()
     with run.lock():
         assert not any(file.exists() for file in left)
+        assert theirs.exists()
     assert (run.path / "config.yaml").exists()
