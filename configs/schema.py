@@ -400,23 +400,23 @@ class TrainConfig:
     model: ModelConfig = field(default_factory=ModelConfig)
     trainer: Any = MISSING
     collector: CollectorConfig = field(default_factory=CollectorConfig)
-    logger: Any = setting("none", "dashboards to write for beside the plain files, one or a list", choices=LOGGER_NAMES)
-    wandb: WandbConfig = field(default_factory=WandbConfig)
-    video_rounds: int = setting(
-        40, "logger=tensorboard or wandb: a film of a flight each so many rounds; 0: none", low=0
-    )
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    seed: int = setting(0, "fixes everything that is drawn", low=0, high=2**32)
+    name: str | None = setting(None, "name of the run; null: trainer and model")
+    device: str = setting("cpu", "where to train: cpu, cuda, cuda:1")
+    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
+    runs: str = setting("runs", "folder for the run folders")
     resume: str | None = setting(
         None, "run folder of a run to go on with; its settings are taken from there, but for those given beside it"
     )
     init_from: str | None = setting(
         None, "run folder whose policy training begins with, and whose model it keeps; null: a fresh one"
     )
-    seed: int = setting(0, "fixes everything that is drawn", low=0, high=2**32)
-    device: str = setting("cpu", "where to train: cpu, cuda, cuda:1")
-    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
-    runs: str = setting("runs", "folder for the run folders")
-    name: str | None = setting(None, "name of the run; null: trainer and model")
+    logger: Any = setting("none", "dashboards to write for beside the plain files, one or a list", choices=LOGGER_NAMES)
+    wandb: WandbConfig = field(default_factory=WandbConfig)
+    video_rounds: int = setting(
+        40, "logger=tensorboard or wandb: a film of a flight each so many rounds; 0: none", low=0
+    )
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
 @dataclass

@@ -7,7 +7,14 @@ from modgnn_rl.configs.schema import CollectConfig
 
 
 def main(config: CollectConfig) -> None:
-    """Fly the expert and write its flights to a dataset that trainer=bc reads; started again, it goes on."""
+    """Fly the expert and write its flights to a dataset that trainer=bc reads; started again, it goes on.
+
+    Examples::
+
+        python -m modgnn_rl.collect episodes=100 steps=500
+        python -m modgnn_rl.collect env=paper env.compile=true threads=2
+        python -m modgnn_rl.collect env.num_agents=16 output=datasets/small-flocks
+    """
     from modgnn_rl.collecting import collect, report
 
     print(report(collect(config)))

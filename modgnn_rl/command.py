@@ -23,12 +23,10 @@ import contextlib
 import dataclasses
 import functools
 import io
-import json
 import os
 import re
 import sys
 import tempfile
-import textwrap
 import traceback
 import typing
 import warnings
@@ -40,9 +38,7 @@ import yaml
 from hydra._internal.utils import get_args_parser
 from hydra.conf import HelpConf, HydraConf, JobConf, RunDir, SweepDir
 from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
@@ -53,19 +49,17 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
+from modgnn_rl.command_help import children, fields, help_text
 from modgnn_rl.errors import InputError
 from modgnn_rl.interruption import Stopped
+from modgnn_rl.overview import completion
 from modgnn_rl.settings import check, suggestion
 
 __all__ = ["run_command", "settings_given"]
 
 Config = TypeVar("Config")
 
-FLAGS = """\
-  --multirun           one run for every combination of comma-separated values, as in seed=0,1,2
-  --config-dir DIR     also look for choices in DIR, for example DIR/trainer/mine.yaml for trainer=mine
-  --cfg job            print the resolved configuration and stop
-  --help               this text, for the choices and settings given beside it"""
+PIPE_CLOSED = 141  # what a shell says of a tool that SIGPIPE ended
 
 # What Hydra raises for a command line or a YAML file that the user can mend, as long as no job has begun.
 USER_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, UserWarning, ValueError)
@@ -93,8 +87,9 @@ def run_command(
         config_path: where Hydra looks for the YAML files.
 
     Raises:
-        SystemExit: with code 2 after an error that the user can mend, 130 after Ctrl-C, 143 after SIGTERM, or the code
-            of ``main``. In a multirun a job that fails does not stop the others; the code is then the highest.
+        SystemExit: with code 2 after an error that the user can mend, 130 after Ctrl-C, 143 after SIGTERM, 141 when
+            who reads the output has seen enough, as in ``| head``, or the code of ``main``. In a multirun a job that
+            fails does not stop the others; the code is then the highest.
     """
     nodes = nodes or {}
     known = [*_dotted(schema), *(f"{k.split('/')[0]}.{key}" for k, node in nodes.items() for key in _dotted(node))]
@@ -116,7 +111,9 @@ def run_command(
                     raise SystemExit(code) from error
                 codes.append(code)
                 failed.append(_job_name())
-            except Exception:
+            except Exception as error:
+                if isinstance(error, BrokenPipeError) and _reader_has_left():
+                    raise SystemExit(PIPE_CLOSED) from error
                 if not (goes_on and act is main):
                     raise
                 traceback.print_exc()
@@ -139,13 +136,23 @@ def run_command(
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("error", message="provider=.* is not available")
+                if flags.shell_completion and flags.overrides and flags.overrides[0].startswith("install="):
+                    print(completion(flags.overrides[0].removeprefix("install=")))  # Hydra's knows no python -m
+                    return
                 for act in [lambda _: 0, main] if rehearse else [main]:
-                    hydra.main(version_base="1.3", config_path=config_path, config_name=name)(job_for(act))()
+                    # Tab is answered by Hydra too; what it offers beside this command's settings is kept back.
+                    with _offering_only(schema) if flags.shell_completion else contextlib.nullcontext():
+                        hydra.main(version_base="1.3", config_path=config_path, config_name=name)(job_for(act))()
+                sys.stdout.flush()  # here a pipe that is closed is still ours to see
         except Stopped as stop:
             sys.exit(stop.code)
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
             sys.exit(130)
+        except BrokenPipeError:
+            if not _reader_has_left():
+                raise
+            sys.exit(PIPE_CLOSED)
         except USER_ERRORS as error:
             if job_began:
                 raise
@@ -154,6 +161,26 @@ def run_command(
         print(f"{len(failed)} of {len(codes)} jobs failed: {'; '.join(failed)}", file=sys.stderr)
     if any(codes):
         sys.exit(max(codes))
+
+
+@contextlib.contextmanager
+def _offering_only(schema: type) -> Iterator[None]:
+    """Print what Tab is offered within, a line each, without choices of other commands and settings of Hydra itself."""
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
+        yield
+    own = {field.name for field in dataclasses.fields(schema)}
+    print("\n".join(word for word in output.getvalue().split() if re.split("[.=]", word.lstrip("+~"))[0] in own))
+
+
+def _reader_has_left() -> bool:
+    """Whether it is the standard output that cannot be written any more; Python must then not try again at its end."""
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def settings_given(config: Any) -> dict[str, Any]:
@@ -205,7 +232,7 @@ def _register(main: Callable[..., Any], schema: type, name: str, nodes: Mapping[
     )
     store.store(group="hydra", name="config", node=conf)
     OmegaConf.register_new_resolver(
-        "modgnn_rl_help", lambda *, _root_: _help(main, name, _root_).replace("$", "$$"), replace=True
+        "modgnn_rl_help", lambda *, _root_: help_text(main, name, _root_).replace("$", "$$"), replace=True
     )
 
 
@@ -228,26 +255,12 @@ def _settings(config: DictConfig, schema: type[Config], name: str, known: list[s
     return typing.cast(Config, settings)
 
 
-def _children(config: DictConfig) -> Iterator[tuple[str, DictConfig]]:
-    """Yield the nodes of a configuration that have settings of their own."""
-    for key in map(str, config):
-        if OmegaConf.is_missing(config, key) or OmegaConf.is_interpolation(config, key):
-            continue
-        if isinstance(child := config[key], DictConfig) and dataclasses.is_dataclass(OmegaConf.get_type(child)):
-            yield key, child
-
-
-def _fields(config: DictConfig) -> tuple[dataclasses.Field[Any], ...]:
-    """Return the fields of the dataclass behind a configuration."""
-    return dataclasses.fields(typing.cast(type, OmegaConf.get_type(config)))
-
-
 def _changed(config: DictConfig, prefix: str = "") -> Iterator[tuple[str, bool]]:
     """Yield each dotted key that the configuration has or its dataclasses have, but not both; true for the latter."""
-    fields = {field.name for field in _fields(config)}
-    for key in fields ^ set(map(str, config)):
-        yield f"{prefix}{key}", key in fields
-    for key, child in _children(config):
+    declared = {field.name for field in fields(config)}
+    for key in declared ^ set(map(str, config)):
+        yield f"{prefix}{key}", key in declared
+    for key, child in children(config):
         yield from _changed(child, f"{prefix}{key}.")
 
 
@@ -295,48 +308,3 @@ def _explain_value(error: OmegaConfBaseException, known: list[str]) -> str:
         return f"{key} must be given, as in {key}=..."
     reason = str(error.msg or error).splitlines()[0]
     return f"{key}: {reason}" if error.full_key else reason
-
-
-def _help(main: Callable[..., Any], name: str, config: DictConfig) -> str:
-    """Return the help text for a composed configuration: its groups, and every setting with its doc and range."""
-    loader = GlobalHydra.instance().config_loader()
-    chosen = config.hydra.runtime.choices
-    lines = [f"python -m modgnn_rl.{name} [group=choice ...] [setting=value ...] [flags]", ""]
-    lines += [*(main.__doc__ or "").strip().splitlines()[:1], ""]
-    groups = sorted(set(loader.list_groups("")) & set(chosen))
-    lines += ["Choices (in use: *)"] if groups else []
-    for group in groups:
-        options = loader.get_group_options(group, ObjectType.CONFIG)
-        if options:
-            lines.append(f"  {group}=" + ", ".join(f"{o}*" if chosen.get(group) == o else o for o in options))
-    lines += [""] if groups else []
-    lines += ["Settings, with the values they have under these choices", *_setting_lines(config)]
-    return "\n".join([*lines, "", "Flags", FLAGS])
-
-
-def _setting_lines(config: DictConfig, prefix: str = "") -> Iterator[str]:
-    """Yield the help on every setting of a configuration, nested ones after those of the node itself."""
-    raw = OmegaConf.to_container(config, resolve=False)
-    fields = _fields(config)
-    children = dict(_children(config))
-    nested = {field.name: children[field.name] for field in fields if field.name in children}
-    for field in fields:
-        if field.name not in nested:
-            value = typing.cast(dict[str, Any], raw)[field.name]
-            shown = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
-            head = f"  {prefix}{field.name}={'<required>' if value == '???' else shown}"
-            text = f"{field.metadata.get('doc', '')}{_range(field.metadata)}"
-            indent = " " * 40
-            body = textwrap.fill(text, 120, initial_indent=indent, subsequent_indent=indent)
-            yield head + body[len(head) :] if len(head) < len(indent) - 1 else f"{head}\n{body}".rstrip()
-    for key, child in nested.items():
-        yield from _setting_lines(child, f"{prefix}{key}.")
-
-
-def _range(rule: Mapping[str, Any]) -> str:
-    """Return the legal values of a setting in brackets, or an empty string."""
-    if rule.get("choices"):
-        return f" [{', '.join(map(str, rule['choices']))}]"
-    words = {"low": "at least", "above": "greater than", "high": "at most"}
-    bounds = [f"{word} {rule[key]}" for key, word in words.items() if rule.get(key) is not None]
-    return f" [{', '.join(bounds)}]" if bounds else ""

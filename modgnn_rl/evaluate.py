@@ -8,7 +8,14 @@ from modgnn_rl.run_folder import RunFolder
 
 
 def main(config: EvaluateConfig) -> None:
-    """Fly a trained policy beside its expert and beside doing nothing, and print and save the table."""
+    """Fly a trained policy beside its expert and beside doing nothing, and print and save the table.
+
+    Examples::
+
+        python -m modgnn_rl.evaluate 'run=runs/<date>-<name>'
+        python -m modgnn_rl.evaluate 'run=runs/<date>-<name>' 'evaluation.num_agents=[8,16,64]'
+        python -m modgnn_rl.evaluate 'run=runs/<date>-<name>' env.physics=bullet env.message_loss=0.2
+    """
     RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
     from modgnn_rl.training import evaluate_run
 

@@ -19,7 +19,13 @@ REPEATS = 300
 
 
 def main(config: ExportConfig) -> None:
-    """Export the policy of a run, agent by agent, to files that fly with numpy and onnxruntime alone."""
+    """Export the policy of a run, agent by agent, to files that fly with numpy and onnxruntime alone.
+
+    Examples::
+
+        python -m modgnn_rl.export 'run=runs/<date>-<name>'
+        python -m modgnn_rl.export 'run=runs/<date>-<name>' output=robot
+    """
     RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
     from modgnn_rl.exporting import export_run
 

@@ -18,7 +18,14 @@ from modgnn_rl.settings import flat
 
 
 def main(config: ReproduceConfig) -> int:
-    """Reproduce the paper's tables beside its figures, or answer a question beyond them; started again, it goes on."""
+    """Reproduce the paper's tables beside its figures, or answer a question beyond them; started again, it goes on.
+
+    Examples::
+
+        python -m modgnn_rl.reproduce scale=smoke
+        python -m modgnn_rl.reproduce scale=small
+        python -m modgnn_rl.reproduce scale=small study=communication seeds=3
+    """
     if config.env.sizes != [REFERENCE_SIZE] or REFERENCE_SIZE not in config.scale.sizes:
         raise InputError(
             f"env.num_agents={config.env.num_agents} and scale.sizes={config.scale.sizes} must be and hold "

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +19,15 @@ __all__ = ["find_run", "show_runs"]
 
 
 def main(config: RunsConfig) -> None:
-    """List runs with their state and main figures, or compare some, from their plain files alone."""
-    text = show_runs(config, width=shutil.get_terminal_size((100, 24)).columns)
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:  # the reader has seen enough, as in `| head`; Python must not flush again at its end
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    """List runs with their state and main figures, or compare some, from their plain files alone.
+
+    Examples::
+
+        python -m modgnn_rl.runs
+        python -m modgnn_rl.runs 'state=[stopped,killed]'
+        python -m modgnn_rl.runs 'compare=[gcn-seed0,gcn-seed1]'
+    """
+    print(show_runs(config, width=shutil.get_terminal_size((100, 24)).columns))
 
 
 def show_runs(config: RunsConfig, width: int = 100) -> str:

@@ -12,7 +12,15 @@ from modgnn_rl.run_folder import RunFolder
 
 
 def main(config: TrainConfig) -> None:
-    """Train a decentralised flocking policy from the Reynolds expert, and compare it with the expert."""
+    """Train a decentralised flocking policy from the Reynolds expert, and compare it with the expert.
+
+    Examples::
+
+        python -m modgnn_rl.train
+        python -m modgnn_rl.train trainer.rounds=10 trainer.num_envs=8 evaluation.num_flocks=10
+        python -m modgnn_rl.train model=modgnn_mlp trainer=bc seed=1
+        python -m modgnn_rl.train 'resume=runs/<date>-<name>'
+    """
     # Folders are looked at before the heavy imports: a typing error must be reported at once.
     for folder in (config.resume, config.init_from):
         if folder is not None:

@@ -326,7 +326,7 @@ def test_the_command_needs_no_torch_and_heeds_a_closed_pipe(tmp_path):
     os.close(reader)
     process = command(f"runs={tmp_path}", stdout=writer)
     os.close(writer)
-    assert (process.communicate(timeout=60)[1], process.returncode) == ("", 0)
+    assert (process.communicate(timeout=60)[1], process.returncode) == ("", 141)
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):

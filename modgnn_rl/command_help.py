@@ -1,0 +1,113 @@
+"""What ``--help`` of a command prints: what it does, examples, choices, and every setting with its doc and range."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import shutil
+import textwrap
+import typing
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
+from omegaconf import DictConfig, OmegaConf
+
+__all__ = ["children", "fields", "help_text"]
+
+FLAGS = {
+    "--multirun": "one run for every combination of comma-separated values, as in seed=0,1,2",
+    "--config-dir DIR": "also look for choices in DIR, for example DIR/trainer/mine.yaml for trainer=mine",
+    "--cfg job": "print the resolved configuration and stop",
+    "--help": "this text, for the choices and settings given beside it",
+}
+
+
+def help_text(main: Callable[..., Any], name: str, config: DictConfig) -> str:
+    """The help on a composed configuration, as wide as the terminal.
+
+    Args:
+        main: the command; its docstring, examples included, heads the help.
+        name: of the command.
+        config: the whole configuration, Hydra's own part included.
+    """
+    width = min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)
+    choices = list(_choices(config, width))
+    usage = f"python -m modgnn_rl.{name} {'[group=choice ...] ' if choices else ''}[setting=value ...] [flags]"
+    summary, _, more = inspect.cleandoc(main.__doc__ or "").partition("\n\n")
+    sections = [[usage], [textwrap.fill(summary, width)], [more.replace("::\n\n", ":\n")]]
+    if choices:
+        sections.append(["Choices (in use: *)", *choices])
+    sections += _settings(config, width)
+    sections.append(["Flags", *(_entry(flag, text, width) for flag, text in FLAGS.items())])
+    return "\n\n".join(filter(None, map("\n".join, sections)))
+
+
+def children(config: DictConfig) -> Iterator[tuple[str, DictConfig]]:
+    """Yield the nodes of a configuration that have settings of their own."""
+    for key in map(str, config):
+        if OmegaConf.is_missing(config, key) or OmegaConf.is_interpolation(config, key):
+            continue
+        if isinstance(child := config[key], DictConfig) and dataclasses.is_dataclass(OmegaConf.get_type(child)):
+            yield key, child
+
+
+def fields(config: DictConfig) -> tuple[dataclasses.Field[Any], ...]:
+    """The fields of the dataclass behind a configuration."""
+    return dataclasses.fields(typing.cast(type, OmegaConf.get_type(config)))
+
+
+def _choices(config: DictConfig, width: int) -> Iterator[str]:
+    """Yield the help on every group of the command: its choices, the one in use marked."""
+    loader = GlobalHydra.instance().config_loader()
+    chosen = config.hydra.runtime.choices
+    for group in sorted(set(loader.list_groups("")) & set(chosen)):
+        options = loader.get_group_options(group, ObjectType.CONFIG)
+        if options:
+            text = f"  {group}=" + ", ".join(f"{o}*" if chosen.get(group) == o else o for o in options)
+            yield textwrap.fill(text, width, subsequent_indent=" " * (len(group) + 3))
+
+
+def _settings(config: DictConfig, width: int, prefix: str = "") -> Iterator[list[str]]:
+    """Yield heading and lines for a configuration, then for each that is nested in it."""
+    raw = typing.cast(dict[str, Any], OmegaConf.to_container(config, resolve=False))
+    names = {field.name for field in fields(config)}
+    nested = {name: child for name, child in children(config) if name in names}  # beside it lies Hydra's own part
+    heading = f"{prefix}* {_summary(config)}" if prefix else "Settings, with the values they have under these choices"
+    lines = [textwrap.fill(heading.strip(), width)]
+    for field in fields(config):
+        if field.name not in nested:
+            value = raw[field.name]
+            shown = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+            head = f"{prefix}{field.name}={'<required>' if value == '???' else shown}"
+            lines.append(_entry(head, f"{field.metadata.get('doc', '')}{_range(field.metadata)}", width))
+    yield lines
+    # The shortest first: the long list of the world's would hide the others.
+    for name in sorted(nested, key=lambda name: len(nested[name])):
+        yield from _settings(nested[name], width, f"{prefix}{name}.")
+
+
+def _summary(config: DictConfig) -> str:
+    """The first line of the docstring of the dataclass behind a configuration, if somebody wrote one."""
+    kind = typing.cast(type, OmegaConf.get_type(config))
+    doc = kind.__doc__ or ""
+    return "" if doc.startswith(f"{kind.__name__}(") else doc.partition("\n")[0]
+
+
+def _entry(head: str, text: str, width: int) -> str:
+    """A word with its explanation beside it, or below it where it is too long for that."""
+    head = f"  {head}"
+    indent = " " * (40 if width >= 100 else 30)
+    body = textwrap.fill(text, width, initial_indent=indent, subsequent_indent=indent)
+    return head + body[len(head) :] if len(head) < len(indent) - 1 else f"{head}\n{body}".rstrip()
+
+
+def _range(rule: Mapping[str, Any]) -> str:
+    """The legal values of a setting in brackets, or an empty string."""
+    if rule.get("choices"):
+        return f" [{', '.join(map(str, rule['choices']))}]"
+    words = {"low": "at least", "above": "greater than", "high": "at most"}
+    bounds = [f"{word} {rule[key]}" for key, word in words.items() if rule.get(key) is not None]
+    return f" [{', '.join(bounds)}]" if bounds else ""
