@@ -136,13 +136,9 @@ def run_command(
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("error", message="provider=.* is not available")
-                if flags.shell_completion and flags.overrides and flags.overrides[0].startswith("install="):
-                    print(completion(flags.overrides[0].removeprefix("install=")))  # Hydra's knows no python -m
-                    return
                 for act in [lambda _: 0, main] if rehearse else [main]:
-                    # Tab is answered by Hydra too; what it offers beside this command's settings is kept back.
-                    with _offering_only(schema) if flags.shell_completion else contextlib.nullcontext():
-                        hydra.main(version_base="1.3", config_path=config_path, config_name=name)(job_for(act))()
+                    start = hydra.main(version_base="1.3", config_path=config_path, config_name=name)(job_for(act))
+                    _answer_tab(start, flags.overrides, schema) if flags.shell_completion else start()
                 sys.stdout.flush()  # here a pipe that is closed is still ours to see
         except Stopped as stop:
             sys.exit(stop.code)
@@ -163,12 +159,17 @@ def run_command(
         sys.exit(max(codes))
 
 
-@contextlib.contextmanager
-def _offering_only(schema: type) -> Iterator[None]:
-    """Print what Tab is offered within, a line each, without choices of other commands and settings of Hydra itself."""
+def _answer_tab(hydra_main: Callable[[], Any], arguments: list[str], schema: type) -> None:
+    """Print our script for ``install=<shell>``, since Hydra's knows no ``python -m``, or what Hydra offers to Tab.
+
+    What it offers beside this command's settings, choices of other commands and settings of its own, is kept back.
+    """
+    if arguments[:1] and arguments[0].startswith("install="):
+        print(completion(arguments[0].removeprefix("install=")))
+        return
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
-        yield
+        hydra_main()
     own = {field.name for field in dataclasses.fields(schema)}
     print("\n".join(word for word in output.getvalue().split() if re.split("[.=]", word.lstrip("+~"))[0] in own))
 

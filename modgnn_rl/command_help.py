@@ -93,7 +93,7 @@ def _summary(config: DictConfig) -> str:
     """The first line of the docstring of the dataclass behind a configuration, if somebody wrote one."""
     kind = typing.cast(type, OmegaConf.get_type(config))
     doc = kind.__doc__ or ""
-    return "" if doc.startswith(f"{kind.__name__}(") else doc.partition("\n")[0]
+    return "" if doc.startswith(f"{kind.__name__}(") else doc.partition("\n")[0].replace("`", "")
 
 
 def _entry(head: str, text: str, width: int) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import EvaluateConfig, WorldChanges
 from modgnn_rl.run_folder import RunFolder
@@ -21,6 +23,8 @@ def main(config: EvaluateConfig) -> None:
 
     file = evaluate_run(config)
     print(f"The table is in {file.with_suffix('.md')}, all figures in {file}")
+    runs = shlex.quote(f"runs={file.absolute().parent.parent}")
+    print(f"Next, beside other runs: python -m modgnn_rl.runs {runs} sort=evaluation")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -53,6 +54,7 @@ def report(exported: Exported, policy: ModGNN) -> str:
     onnx = latency(OnnxAgent(exported.folder), observation.numpy(), messages.numpy())
     files = sorted(exported.folder.iterdir())
     frequency = about["control_frequency"]
+    alone = f"from onnx_agent import OnnxAgent as A; a = A('.'); a.observe([0.0] * {len(observation)}); a.receive([]); print(a.act())"
     lines = [
         f"{about['model'] or 'The policy'}, {about['parameters']} parameters, is in {exported.folder}",
         *(f"  {file.name:<14}{file.stat().st_size / 1000:7.1f} kB" for file in files),
@@ -62,6 +64,7 @@ def report(exported: Exported, policy: ModGNN) -> str:
         + (f", {frequency:g} times a second, by" if frequency else " by"),
         "  agent = onnx_agent.OnnxAgent('.')",
         "  message = agent.observe(observation); agent.receive(messages_of_neighbours); action = agent.act()",
+        f"Next, alone in the world: cd {shlex.quote(str(exported.folder))} && python -c {shlex.quote(alone)}",
     ]
     return "\n".join(lines)
 

@@ -15,7 +15,7 @@ __all__ = ["commands", "completion", "overview"]
 
 HERE = Path(__file__).parent
 FIRST = {
-    "train": "trainer.rounds=10 trainer.num_envs=8 evaluation.num_flocks=10",
+    "train": "trainer.rounds=10 evaluation.num_flocks=10",
     "runs": "",
 }
 

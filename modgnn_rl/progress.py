@@ -82,10 +82,12 @@ class Progress:
 
         Args:
             n: how many units were done since the last call.
-            **figures: numbers (shown with three digits) and texts by name; others keep their last value.
+            **figures: numbers (shown with three digits) and texts by name; others keep their last value. One that is
+                not known yet, NaN, is not shown.
         """
         self.done += n
         self.figures |= {key: value if isinstance(value, str) else f"{value:.3g}" for key, value in figures.items()}
+        self.figures = {key: text for key, text in self.figures.items() if text != "nan"}
         if self._bar is not None:
             self._bar.set_postfix_str(self._postfix(), refresh=False)
             self._bar.update(n)

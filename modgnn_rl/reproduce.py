@@ -55,6 +55,8 @@ def main(config: ReproduceConfig) -> int:
         print(f"failed: {line}", file=sys.stderr)
     if outcome.failures:
         print("The same command tries what failed again, and keeps the rest", file=sys.stderr)
+    else:
+        print(f"Next: python -m webbrowser {page.as_uri()}")
     return 1 if outcome.failures else 0
 
 

@@ -46,8 +46,21 @@ def list_runs(runs: Sequence[RunSummary], width: int | None = None) -> str:
         cells["run"] = [_shortened(name, max(SHORTEST_NAME, longest)) for name in cells["run"]]
         table = aligned(list(zip(*cells.values(), strict=True)))
     notes = [printable(f"{run.name}: {note}") for run in runs if (note := run.problem or run.reason)]
-    parts = [table, "\n".join(notes), textwrap.fill(LEGEND, width or 120), "\n".join(next_steps(runs))]
+    parts = [
+        table,
+        "\n".join(notes),
+        textwrap.fill(LEGEND, width or 120),
+        "\n".join(next_steps(runs) or _next_looks(runs)),
+    ]
     return "\n\n".join(part for part in parts if part)
+
+
+def _next_looks(runs: Sequence[RunSummary]) -> list[str]:
+    """What to do with the last of those that are finished."""
+    finished = list(dict.fromkeys(run.run for run in runs if run.state == "finished"))
+    if len(finished) > 1:
+        return [f"Next: python -m modgnn_rl.runs {shlex.quote(f'compare=[{finished[-2]},{finished[-1]}]')}"]
+    return [f"Next: python -m modgnn_rl.evaluate {shlex.quote(f'run={run}')}" for run in finished]
 
 
 def sort_key(run: RunSummary, sort: str) -> tuple[float, str]:

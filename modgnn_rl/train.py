@@ -17,7 +17,7 @@ def main(config: TrainConfig) -> None:
     Examples::
 
         python -m modgnn_rl.train
-        python -m modgnn_rl.train trainer.rounds=10 trainer.num_envs=8 evaluation.num_flocks=10
+        python -m modgnn_rl.train trainer.rounds=10 evaluation.num_flocks=10
         python -m modgnn_rl.train model=modgnn_mlp trainer=bc seed=1
         python -m modgnn_rl.train 'resume=runs/<date>-<name>'
     """
