@@ -54,7 +54,8 @@ def report(exported: Exported, policy: ModGNN) -> str:
     onnx = latency(OnnxAgent(exported.folder), observation.numpy(), messages.numpy())
     files = sorted(exported.folder.iterdir())
     frequency = about["control_frequency"]
-    alone = f"from onnx_agent import OnnxAgent as A; a = A('.'); a.observe([0.0] * {len(observation)}); a.receive([]); print(a.act())"
+    step = f"a.observe([0.0] * {len(observation)}); a.receive([]); print(a.act())"
+    alone = f"from onnx_agent import OnnxAgent as A; a = A('.'); {step}"
     lines = [
         f"{about['model'] or 'The policy'}, {about['parameters']} parameters, is in {exported.folder}",
         *(f"  {file.name:<14}{file.stat().st_size / 1000:7.1f} kB" for file in files),
