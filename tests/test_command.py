@@ -18,6 +18,7 @@ import pytest
 from modgnn_rl.command import run_command, settings_given
 from modgnn_rl.errors import InputError
 from modgnn_rl.interruption import Stopped
+from modgnn_rl.overview import completion
 from modgnn_rl.settings import setting
 
 ROOT = Path(__file__).parent.parent
@@ -277,6 +278,56 @@ def test_cfg_job_prints_the_configuration(run: Run) -> None:
     assert (outcome.code, outcome.configs) == (0, [])
     assert outcome.out.startswith("seed: 7\n")
     assert "hydra" not in outcome.out
+
+
+def test_help_is_as_wide_as_the_terminal_and_has_a_section_for_each_node(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = {}
+    for width in (80, 120):
+        monkeypatch.setenv("COLUMNS", str(width))
+        lines = run("--help").out.splitlines()
+        assert max(map(len, lines)) <= width
+        texts[width] = " ".join(run("--help").out.split())
+        assert lines.index("env.* A group with one dataclass.") < lines.index(
+            "trainer.* A choice with settings of its own."
+        )
+    assert texts[80] == texts[120]
+
+
+def test_help_shows_the_examples_of_the_docstring(run: Run) -> None:
+    def main(config: Toy) -> None:
+        """Fly a toy flock.
+
+        Examples::
+
+            python -m toy seed=1
+        """
+
+    lines = run("--help", main=main).out.splitlines()
+    assert lines[2:7] == ["Fly a toy flock.", "", "Examples:", "    python -m toy seed=1", ""]
+
+
+def test_tab_offers_nothing_of_hydra_itself(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COMP_LINE", "toy ")
+    assert set(run("--shell-completion", "query=bash").out.split()) == {
+        *("seed=", "source=", "env=", "env.", "trainer=", "trainer."),
+    }
+
+
+def test_the_script_for_a_shell_is_ours(run: Run) -> None:
+    assert run("-sc", "install=bash").out == f"{completion('bash')}\n"
+    outcome = run("-sc", "install=tcsh")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err == "error: there is completion for bash, fish, zsh, not for tcsh\n"
+
+
+def test_a_broken_pipe_of_something_else_is_a_bug(run: Run) -> None:
+    def main(config: Toy) -> None:
+        raise BrokenPipeError("a worker's")
+
+    with pytest.raises(BrokenPipeError, match="worker"):
+        run(main=main)
 
 
 def test_tab_completes_choices_and_settings(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

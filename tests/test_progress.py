@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 
 import pytest
 
@@ -49,6 +50,16 @@ def test_a_short_run_has_its_last_line_only():
     (line,) = stream.getvalue().splitlines()
     assert line.startswith("evaluate: 100% 10.0/10.0, row expert, error 1e-05 [")
     assert (progress.done, progress.total) == (10, 10)
+
+
+def test_a_figure_that_is_not_known_yet_is_not_shown():
+    stream = io.StringIO()
+    with Progress("dagger", 2, stream=stream, every=0.0, clock=Clock()) as progress:
+        progress.update(1, round="0/1", error=math.nan)
+        progress.update(1, round="1/1", error=0.5)
+    first, second, _ = stream.getvalue().splitlines()
+    assert "round 0/1 [" in first
+    assert "round 1/1, error 0.5 [" in second
 
 
 def test_a_terminal_has_one_live_line():
