@@ -116,6 +116,18 @@ def test_the_reason_is_that_of_the_last_end(tmp_path):
     assert "SIGTERM" not in show_runs(RunsConfig(runs=str(tmp_path)))
 
 
+def test_the_last_line_says_what_to_do_next(tmp_path):
+    def last_line():
+        return show_runs(RunsConfig(runs=str(tmp_path))).splitlines()[-1]
+
+    first = make_run(tmp_path, "first").path
+    assert last_line() == f"Next: python -m modgnn_rl.evaluate run={first}"
+    second = make_run(tmp_path, "second").path
+    assert last_line() == f"Next: python -m modgnn_rl.runs 'compare=[{first},{second}]'"
+    stopped = make_run(tmp_path, "third", state="stopped").path
+    assert last_line() == f"Next: python -m modgnn_rl.train resume={stopped}"
+
+
 def test_looking_changes_nothing(tmp_path):
     with make_run(tmp_path, state="training").lock():
         write_evaluation(make_run(tmp_path, "bc-gcn"), {"moment_force": 0.5})
