@@ -18,6 +18,7 @@ __all__ = [
     "REFERENCE_SIZE",
     "BCConfig",
     "CollectConfig",
+    "CollectorConfig",
     "DAggerConfig",
     "EvaluateConfig",
     "EvaluationConfig",
@@ -27,6 +28,7 @@ __all__ = [
     "MAPPOConfig",
     "ModelConfig",
     "ReplayConfig",
+    "RunsConfig",
     "TrainConfig",
     "TrainerConfig",
     "WandbConfig",
@@ -371,12 +373,33 @@ class EvaluationConfig:
 
 
 @dataclass
+class CollectorConfig:
+    """Which processes fly the flocks that a trainer learns from."""
+
+    name: str = setting(
+        "single",
+        "who flies: this process, worker processes on this machine, or Ray, here or on a cluster",
+        choices=("single", "process", "ray"),
+    )
+    workers: int | None = setting(
+        None, "collector=process or ray: workers, among which the flocks are shared out; null: one a core", low=1
+    )
+    timeout: float = setting(
+        60.0, "longest wait for a worker's flights; one that takes longer is ended and replaced, s", above=0
+    )
+    ray_address: str | None = setting(
+        None, "collector=ray: address of a Ray cluster, as in 10.0.0.1:6379; null: Ray is started on this machine"
+    )
+
+
+@dataclass
 class TrainConfig:
     """A training run."""
 
     env: FlockingConfig = field(default_factory=FlockingConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     trainer: Any = MISSING
+    collector: CollectorConfig = field(default_factory=CollectorConfig)
     logger: Any = setting("none", "dashboards to write for beside the plain files, one or a list", choices=LOGGER_NAMES)
     wandb: WandbConfig = field(default_factory=WandbConfig)
     video_rounds: int = setting(
@@ -457,3 +480,24 @@ class ReplayConfig:
     port: int = setting(8080, "viewer=true: port on this machine", low=1, high=65535)
     device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
     threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
+
+
+@dataclass
+class RunsConfig:
+    """A look at runs."""
+
+    runs: str = setting("runs", "folder of the run folders")
+    compare: Any = setting(
+        None, "runs to compare, a list: folders, or parts of names that one run alone has; null: all are listed"
+    )
+    state: Any = setting(
+        None,
+        "list only runs that stand like this, one or several; null: all",
+        choices=("training", "evaluating", "finished", "stopped", "failed", "killed", "unknown", "unreadable"),
+    )
+    sort: str = setting(
+        "started",
+        "order of the list: the newest, the longest or the best at its end",
+        choices=("started", "updated", "seconds", "error", "reward", "validation_loss", "evaluation"),
+    )
+    format: str = setting("text", "how it is written", choices=("text", "markdown", "json"))

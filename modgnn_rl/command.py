@@ -128,6 +128,8 @@ def run_command(
     # Hydra's own error messages run over several lines; with this set it raises what happened instead.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     flags = _flags()
+    if flags.multirun and "TORCHELASTIC_RUN_ID" in os.environ:
+        sys.exit(_report("torchrun starts one run, --multirun several; start torchrun once for each run"))
     # All jobs of a multirun are checked before the first begins, unless the user brings a launcher or a sweeper.
     rehearse = flags.multirun and not any(override.startswith("hydra/") for override in flags.overrides)
     goes_on = flags.multirun  # a job that fails does not stop the others

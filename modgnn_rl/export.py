@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import ExportConfig
+from modgnn_rl.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from modgnn_rl.exporting import Exported
@@ -19,6 +20,7 @@ REPEATS = 300
 
 def main(config: ExportConfig) -> None:
     """Export the policy of a run, agent by agent, to files that fly with numpy and onnxruntime alone."""
+    RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
     from modgnn_rl.exporting import export_run
 
     print(report(*export_run(config)))

@@ -92,4 +92,5 @@ class Interruption:
         self._asked = number
         if not self._defers:
             raise Stopped(number)
-        os.write(2, f"\n{self._advice}\n".encode())  # print is not safe here: it may have been interrupted itself
+        if self._advice:
+            os.write(2, f"\n{self._advice}\n".encode())  # print is not safe here: it may have been interrupted itself

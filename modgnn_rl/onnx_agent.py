@@ -51,7 +51,11 @@ class OnnxAgent:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         folder = Path(path) if Path(path).is_dir() else Path(path).parent
         self.metadata, model = _load(folder)
-        self._session = open_session(model)
+        try:
+            self._session = open_session(model)
+        except Exception as error:  # onnxruntime's have no base of their own
+            reason = str(error).splitlines()[0]
+            raise AgentError(f"{folder / 'agent.onnx'} is no model that onnxruntime can run ({reason})") from error
         self._inputs: dict[str, tuple[list[Any], np.dtype[Any]]] = {
             name: (spec["shape"], np.dtype(spec["dtype"])) for name, spec in self.metadata["inputs"].items()
         }

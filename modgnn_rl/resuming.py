@@ -38,6 +38,7 @@ FIXED = (
 FLOWN = (
     "env",
     "device",
+    "collector",
     "trainer.num_envs",
     "trainer.held_out",
     "trainer.capacity",
@@ -45,7 +46,7 @@ FLOWN = (
     "trainer.replacement",
     "trainer.hide_velocity",
 )
-NOT_FLOWN = ("env.on_nonfinite",)
+NOT_FLOWN = ("env.on_nonfinite", "collector.timeout", "collector.ray_address")
 
 
 def stored_config(run: RunFolder) -> TrainConfig:

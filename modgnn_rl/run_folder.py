@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import math
 import os
@@ -152,14 +153,20 @@ class RunFolder:
 
     @property
     def is_locked(self) -> bool:
-        """Whether a process trains in this folder now."""
+        """Whether a process trains in this folder now; found without the right to write there."""
         try:
-            with FileLock(self._lock_file).acquire(timeout=0) if self._lock_file.exists() else contextlib.nullcontext():
-                return False
-        except Timeout:
-            return True
-        except OSError:  # a folder that this user may only read
+            descriptor = os.open(self._lock_file, os.O_RDONLY)
+        except FileNotFoundError:
             return False
+        except OSError:
+            return True  # unknown: believe what the status says
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # `lock` takes the exclusive one
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(descriptor)
+        return False
 
     @property
     def status(self) -> dict[str, Any]:

@@ -15,6 +15,8 @@ from modgnn_rl.errors import InputError
 
 __all__ = ["Summary", "interquartile_mean", "paired_difference", "summarise"]
 
+BLOCK = 1 << 20  # values that are resampled at once
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -53,7 +55,9 @@ def summarise(
         raise InputError(
             f"confidence={confidence}, resamples={resamples}: give a confidence between 0 and 1 and resamples >= 1"
         )
-    means = [data[rng.integers(data.size, size=data.size)].mean() for _ in range(resamples)]
+    block = max(1, BLOCK // data.size)
+    draws = [min(block, resamples - done) for done in range(0, resamples, block)]
+    means = np.concatenate([data[rng.integers(data.size, size=(count, data.size))].mean(1) for count in draws])
     tail = (1 - confidence) / 2
     low, high = np.quantile(means, [tail, 1 - tail])
     return Summary(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation import Flights
 from modgnn_rl.statistics import paired_difference, summarise
+from modgnn_rl.text_tables import markdown
 
 __all__ = ["as_markdown", "read_tables", "summarise_flights"]
 
@@ -94,20 +95,10 @@ def as_markdown(tables: Mapping[str, Any], title: str) -> str:
         shapes = [SHAPE_HEADER, *([name, *_shape_cells(row)] for name, row in rows.items())]
         parts += [
             f"## {size} agents, {table['num_flocks']} flights of {table['steps']} steps",
-            _grid(errors),
-            _grid(shapes),
+            markdown(errors),
+            markdown(shapes),
         ]
     return "\n\n".join([*parts, NOTE]) + "\n"
-
-
-def _grid(rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; the first row is the header."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
-    ]
-    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    return "\n".join(lines)
 
 
 def _error_cells(row: Mapping[str, Any]) -> list[str]:

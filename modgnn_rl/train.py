@@ -19,14 +19,15 @@ def main(config: TrainConfig) -> None:
             RunFolder.open(folder)
     if config.resume is None:
         RunFolder.check_root(config.runs)
+    from modgnn_rl.distributed import say
     from modgnn_rl.training import resume, train
 
     if config.resume is None:
         run = train(config)
     else:
         run = resume(config.resume, {key: value for key, value in settings_given(config).items() if key != "resume"})
-    print(f"Policy, metrics and table are in {run.path}")
-    print(f"Next: python -m modgnn_rl.evaluate {shlex.quote(f'run={run.path}')} 'evaluation.num_agents=[8,16,64]'")
+    say(f"Policy, metrics and table are in {run.path}")
+    say(f"Next: python -m modgnn_rl.evaluate {shlex.quote(f'run={run.path}')} 'evaluation.num_agents=[8,16,64]'")
 
 
 if __name__ == "__main__":

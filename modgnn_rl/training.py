@@ -16,13 +16,19 @@ import torch
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
+from modgnn_rl import distributed
 from modgnn_rl.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
 from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation import evaluate
 from modgnn_rl.interruption import Interruption
+<<<<<<< HEAD
 from modgnn_rl.loading import changed_world, load_policy
 from modgnn_rl.loggers import check_logger, make_logger
+=======
+from modgnn_rl.loading import load_policy, stored_world
+from modgnn_rl.loggers import Dashboards, check_logger, make_logger
+>>>>>>> d010b554a4e1ba53d5399ae8ba68c792586097fc
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.recording import Recorder, spacing
 from modgnn_rl.replay_page import write_replay
@@ -49,7 +55,8 @@ def train(
     """Train a policy, evaluate it, and leave everything in a new run folder.
 
     Ctrl-C and SIGTERM let the round end, write a checkpoint and raise `modgnn_rl.interruption.Stopped`; `resume` goes
-    on from there, or from the last checkpoint before whatever else ended the run.
+    on from there, or from the last checkpoint before whatever else ended the run. In processes that ``torchrun`` has
+    started, all train together; the first alone writes into the folder and evaluates.
 
     Args:
         config: all settings.
@@ -61,11 +68,11 @@ def train(
         InputError: a bad setting, or a device or a logger that this machine does not have; nothing is created then.
     """
     config = _checked(config, expert)
-    name = config.name or f"{config.trainer.name}-{config.model.name}"
-    run = RunFolder.create(config.runs, name, OmegaConf.to_yaml(OmegaConf.structured(config)))
-    with run.lock():
-        print(f"Training in {run.path}", flush=True)
-        return _work(config, run, expert, callbacks)
+    with distributed.joined(config.device):
+        run = _new_run(config)
+        with _lock(run):
+            distributed.say(f"Training in {run.path}")
+            return _work(config, run, expert, callbacks)
 
 
 def resume(
@@ -96,22 +103,24 @@ def resume(
     config = changed_config(old, changes or {})
     changed = differences(old, config)
     config = _checked(config, expert)
-    with run.lock():
+    with distributed.joined(config.device), _lock(run):
         checkpoint = load_checkpoint(run.checkpoints) if has_checkpoint(run.checkpoints) else None
         anew = begins_anew(changed)
-        if changed:
+        if changed and distributed.is_first():
             run = run.with_config(OmegaConf.to_yaml(OmegaConf.structured(config)))
         where = "its start, for it has no checkpoint yet" if checkpoint is None else f"round {checkpoint.step}"
-        print(f"Resuming {run.path} from {where}", flush=True)
+        distributed.say(f"Resuming {run.path} from {where}")
         if anew and checkpoint is not None:
-            print(f"Flocks begin anew, with no data, because of {', '.join(anew)}", flush=True)
+            distributed.say(f"Flocks begin anew, with no data, because of {', '.join(anew)}")
+        elif distributed.size() > 1 and checkpoint is not None:
+            distributed.say("Flocks begin anew, with no data, in all processes but the first, whose flocks are kept")
         return _work(config, run, expert, callbacks, checkpoint, keeps_flocks=not anew)
 
 
 def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainConfig:
     """The settings of a run, with the model settled, after everything that can be refused has been looked at."""
     check(config)
-    prepare_torch(config.device, config.threads)
+    prepare_torch(distributed.own_device(config.device), config.threads)
     check_logger(config)
     config = settle_model(config)
     check_training(config)
@@ -120,6 +129,21 @@ def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainC
             "trainer.dataset holds the labels of Reynolds flocking, not those of your expert; leave one out"
         )
     return config
+
+
+def _new_run(config: TrainConfig) -> RunFolder:
+    """A new folder that the first process makes; others learn where it is."""
+    if not distributed.is_first():
+        return RunFolder(Path(distributed.texts("")[0]), {})
+    name = config.name or f"{config.trainer.name}-{config.model.name}"
+    run = RunFolder.create(config.runs, name, OmegaConf.to_yaml(OmegaConf.structured(config)))
+    distributed.texts(str(run.path))
+    return run
+
+
+def _lock(run: RunFolder) -> contextlib.AbstractContextManager[None]:
+    """The lock of a run folder, which the first process holds for all."""
+    return run.lock() if distributed.is_first() else contextlib.nullcontext()
 
 
 def _work(
@@ -131,23 +155,28 @@ def _work(
     *,
     keeps_flocks: bool = True,
 ) -> RunFolder:
-    """Train from the beginning or from a checkpoint, then evaluate."""
-    dashboards = make_logger(config, run)
+    """Train from the beginning or from a checkpoint, then evaluate, which the first process does alone."""
+    first = distributed.is_first()
+    dashboards = make_logger(config, run) if first else Dashboards({})
     watches = [Watch(config, run, dashboards, expert)] if dashboards else []
     with Interruption().listen() as interruption:
-        session = Session(
-            config, run, dashboards, expert, [*callbacks, *watches], checkpoint, keeps_flocks, interruption
-        )
+        own = distributed.own_part(config, checkpoint.step if checkpoint else 0)
+        keeps_flocks = keeps_flocks and first
+        session = Session(own, run, dashboards, expert, [*callbacks, *watches], checkpoint, keeps_flocks, interruption)
         try:
             policies = TRAINERS[config.trainer.name](session)
+            distributed.leave()
+            if not first:
+                return run
             run.note_status("evaluating")
             sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
-            world, settings, device = config.env, config.evaluation, config.device
+            world, settings, device = config.env, config.evaluation, own.device
             tables = evaluate_policies(run, policies, world, settings, sizes, device, expert=expert)
             log_evaluation(dashboards, tables)
             run.note_status("finished")
         except BaseException as error:
-            _note_end(run, error)
+            if first:
+                _note_end(run, error)
             raise
         finally:
             for where in dashboards.close():

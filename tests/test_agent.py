@@ -166,7 +166,7 @@ COMMUNICATIONS: dict[str, tuple[Callable[[], nn.Module], LinkData]] = {
 }
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(
     communication=st.sampled_from(sorted(COMMUNICATIONS)),
     hops=st.lists(st.integers(0, 3), min_size=1, max_size=2),

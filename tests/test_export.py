@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
+import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -227,6 +230,24 @@ def test_other_damage_is_one_sentence_too(copied: Path) -> None:
         OnnxAgent(copied)
     with pytest.raises(AgentError, match="holds no exported agent"):
         OnnxAgent(copied / "nowhere" / "agent.onnx")
+
+
+@pytest.mark.parametrize("name", ["agent.onnx", "agent.json"])
+@pytest.mark.parametrize("forged", [False, True], ids=["plain", "with its hash"])
+def test_a_pickle_is_refused_and_not_run(copied: Path, name: str, forged: bool) -> None:
+    mark = copied.parent / "executed"
+
+    class Malicious:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return os.mkdir, (str(mark),)
+
+    content = pickle.dumps(Malicious())
+    (copied / name).write_bytes(content)
+    if forged and name == "agent.onnx":
+        change(copied / "agent.json", lambda about: about["files"].update({name: hashlib.sha256(content).hexdigest()}))
+    with pytest.raises(AgentError):
+        OnnxAgent(copied)
+    assert not mark.exists()
 
 
 SEEN: list[Any] = [np.zeros(FEATURES), {"sensors.battery": [0.0]}]

@@ -161,7 +161,6 @@ def by_the_formula(layer: ModGNNLayer, seen: Tensor, data: TensorDict) -> tuple[
     return torch.stack(outputs), torch.stack(messages).view(steps, agents, layer.hops, len(nothing))
 
 
-@settings(max_examples=250)
 @given(
     make=st.sampled_from([full_layer, bare_layer, keyed_layer]),
     hops=st.integers(0, 3),
@@ -193,7 +192,7 @@ def test_one_layer_is_the_formula(
         same(messages[flock], expected[1])
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(hops=st.lists(st.integers(0, 2), min_size=2, max_size=3), start=st.sampled_from(STARTS), seed=st.integers(0, 99))
 @torch.no_grad()
 def test_a_later_layer_sees_the_outputs_of_all_earlier_ones(hops: list[int], start: str, seed: int) -> None:

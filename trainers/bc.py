@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import ReplayBuffer
 
+from modgnn_rl import distributed
 from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
 from modgnn_rl.dataset import FlightDataset
@@ -106,7 +107,7 @@ def _own_folders(run: RunFolder, members: Mapping[str, TrainConfig], by_name: Ma
     """At the end, after Ctrl-C too, give each of several policies a run folder of its own inside the run's."""
 
     def write() -> None:
-        for name, member in members.items() if len(members) > 1 else ():
+        for name, member in members.items() if len(members) > 1 and distributed.is_first() else ():
             own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
             learner = by_name[name]
             if learner.updates_done:  # a run stopped before it went on leaves what it had
@@ -154,7 +155,7 @@ def _share(settings: BCConfig, unseen: Flocks, window: int) -> ReplayBuffer:
     A dataset holds no messages: windows make them anew.
     """
     # `check_training` has verified it.
-    dataset = FlightDataset.open(str(settings.dataset), verify=False, device=unseen.env.device)
+    dataset = FlightDataset.open(str(settings.dataset), verify=False, device=unseen.device)
     seen = dataset.episodes - settings.held_out
     draws: dict[str, Any] = {
         "length": window,

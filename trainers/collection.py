@@ -12,14 +12,15 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRobinWriter
 
-from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, ImitationConfig, TrainConfig
+from modgnn_rl.configs.schema import REFERENCE_SIZE, CollectorConfig, FlockingConfig, ImitationConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.equivariant import is_equivariant
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.seeds import derive_seed, seeded
 from modgnn_rl.trainers.imitation import are_alike
 from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture, SafetyGate, spread
-from modgnn_rl.trainers.saving import Tensors
+from modgnn_rl.trainers.remote import RemoteFlights
+from modgnn_rl.trainers.saving import Part, Tensors
 
 __all__ = [
     "FlockCollector",
@@ -27,6 +28,7 @@ __all__ = [
     "as_windows",
     "flocks_of",
     "flocks_of_all_sizes",
+    "make_flights",
     "named_flocks",
     "reservoir_places",
     "stores_messages",
@@ -61,7 +63,6 @@ class FlockCollector:
         seed: int,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.num_agents = num_agents
         self.env = FlockingEnv(
             num_envs, num_agents, config=config, seed=derive_seed(seed, "env"), device=device, stagger=True
         )
@@ -113,7 +114,20 @@ class FlockCollector:
         self.collector.shutdown()
 
 
-class Flocks(FlockCollector):
+def make_flights(
+    collector: CollectorConfig | None, config: FlockingConfig, *arguments: Any, **options: Any
+) -> FlockCollector | RemoteFlights:
+    """Flocks of one size, flown in this process (also for None) or by workers; for the arguments see `FlockCollector`.
+
+    Raises:
+        InputError: see `RemoteFlights`.
+    """
+    if collector is None or collector.name == "single":
+        return FlockCollector(config, *arguments, **options)
+    return RemoteFlights(config, *arguments, **options, collector=collector)
+
+
+class Flocks:
     """Flocks of one size, flown by a mixture of policy and expert, and their data.
 
     `keep` adds windows of flights to the replay buffer.
@@ -131,8 +145,10 @@ class Flocks(FlockCollector):
         gate: lets the expert fly where the policy strays.
         seed: seeds the environment, the mixture and the sampling of batches.
         device: where flocks and data live.
+        collector: which processes fly; default: this one.
 
     Attributes:
+        flights: the flights that never end.
         window: steps of a window of the data.
         mixture, disturbance: who flies, and how it is disturbed.
         buffer: the data.
@@ -153,8 +169,10 @@ class Flocks(FlockCollector):
         gate: SafetyGate | None = None,
         seed: int,
         device: torch.device | str = "cpu",
+        collector: CollectorConfig | None = None,
     ) -> None:
-        self.settings = settings
+        self.settings, self.device = settings, torch.device(device)
+        self.noise = torch.Generator().manual_seed(derive_seed(seed, "places"))
         self.window = window_of(policies, settings)
         self.keys = {*(key for policy in policies for key in policy.in_keys), ("agents", "controlled")}
         self.keys |= {*expert.out_keys[:1]}
@@ -165,7 +183,9 @@ class Flocks(FlockCollector):
         flown = Ensemble(policies) if gate is not None and gate.measure is spread else policies[0]
         gates = [] if gate is None else [gate]
         behaviour = (flown, expert, self.mixture, *gates, self.disturbance)
-        super().__init__(config, num_envs, num_agents, behaviour, steps=steps, seed=seed, device=device)
+        self.flights = make_flights(
+            collector, config, num_envs, num_agents, behaviour, steps=steps, seed=seed, device=device
+        )
         self.mixture.restart()  # the collector has tried the policy out
         self.seen = 0
         self._owns_data = True
@@ -181,7 +201,7 @@ class Flocks(FlockCollector):
     def fly(self, expert_share: float) -> TensorDictBase:
         """Continue the flights by some steps, and label every state with the expert's action; flights [B, T]."""
         self.mixture.share = expert_share
-        return self.continue_flights()
+        return self.flights.continue_flights()
 
     def keep(self, flights: TensorDictBase) -> None:
         """Add windows of flights to the data; where these are full, what ``settings.replacement`` says goes."""
@@ -198,7 +218,8 @@ class Flocks(FlockCollector):
     def generators(self) -> dict[str, torch.Generator]:
         """All that draws at random here, by name."""
         return {
-            **super().generators,
+            **self.flights.generators,
+            "places": self.noise,
             "mixture": self.mixture.generator,
             "disturbance": self.disturbance.generator,
             "batches": self.buffer._rng,
@@ -210,7 +231,7 @@ class Flocks(FlockCollector):
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
         """What a checkpoint holds of flights and data."""
-        tensors, values = super().state()
+        tensors, values = self.flights.state()
         tensors["mixture"] = self.mixture.state()
         values |= {"disturbance": self.disturbance.scale, "seen": self.seen}
         if self._owns_data and self.settings.checkpoint_data and len(self.buffer):
@@ -224,7 +245,7 @@ class Flocks(FlockCollector):
         Raises:
             KeyError, RuntimeError: these are flights or data of others.
         """
-        super().restore(tensors, values)
+        self.flights.restore(tensors, values)
         self.mixture.restore(tensors["mixture"])
         self.disturbance.scale = float(values["disturbance"])
         if "data" in tensors:
@@ -232,6 +253,10 @@ class Flocks(FlockCollector):
             self.buffer.extend(TensorDict(tensors["data"], [rows, self.window]).unflatten_keys("/"))
             self.buffer.writer.load_state_dict(values["writer"])
             self.seen = int(values["seen"])
+
+    def close(self) -> None:
+        """End the flights."""
+        self.flights.close()
 
 
 def reservoir_places(
@@ -288,6 +313,7 @@ def flocks_of_all_sizes(
             gate=gate,
             seed=derive_seed(config.seed, "flocks", size),
             device=config.device,
+            collector=config.collector,
         )
         for size in config.env.sizes
     }
@@ -301,13 +327,15 @@ def validation_flocks(
     steps: int,
     stretch: int,
 ) -> dict[int, Flocks]:
-    """The ``trainer.held_out`` flocks whose flights are not trained on, by size; see `flocks_of_all_sizes`."""
+    """The ``trainer.held_out`` flocks of each size whose flights are not trained on, flown in this process."""
     held_out = dataclasses.replace(config.trainer, num_envs=config.trainer.held_out)
-    apart = dataclasses.replace(config, trainer=held_out, seed=derive_seed(config.seed, "validation"))
+    apart = dataclasses.replace(
+        config, trainer=held_out, seed=derive_seed(config.seed, "validation"), collector=CollectorConfig()
+    )
     return flocks_of_all_sizes(apart, policies, expert, steps=steps, stretch=stretch)
 
 
-def named_flocks(training: Mapping[int, FlockCollector], validation: Mapping[int, FlockCollector]) -> dict[str, Any]:
+def named_flocks(training: Mapping[int, Part], validation: Mapping[int, Part]) -> dict[str, Any]:
     """All flocks of a run by the names that checkpoints give them."""
     return {
         **{str(size): group for size, group in training.items()},

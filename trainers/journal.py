@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import shlex
+import signal
 import time
 import warnings
 from collections.abc import Iterator, Mapping
@@ -12,14 +13,18 @@ from types import TracebackType
 from typing import Any, Protocol
 
 from tensordict import TensorDictBase
+from torch import Tensor
 
+from modgnn_rl import distributed
 from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.configs.schema import TrainerConfig
 from modgnn_rl.errors import InputError
+from modgnn_rl.interruption import Stopped
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.progress import Progress
 from modgnn_rl.trainers.callbacks import Callback
-from modgnn_rl.trainers.collection import FlockCollector
+from modgnn_rl.trainers.collection import FlockCollector, Flocks
+from modgnn_rl.trainers.remote import RemoteFlights
 from modgnn_rl.trainers.saving import Part, gather, scatter
 from modgnn_rl.trainers.session import Session
 
@@ -42,7 +47,8 @@ class Learns(Part, Protocol):
 class Journal:
     """Counts the rounds of a run, writes their metrics and checkpoints, and calls the callbacks.
 
-    A run that goes on from a checkpoint begins with all as it was there, once the journal is entered.
+    A run that goes on from a checkpoint begins with all as it was there, once the journal is entered. Where several
+    processes train together, the first alone writes, and metrics are means over all.
 
     Args:
         session: the run.
@@ -61,7 +67,7 @@ class Journal:
         self,
         session: Session,
         learners: Mapping[str, Learns],
-        flocks: Mapping[str, FlockCollector],
+        flocks: Mapping[str, Flocks | FlockCollector | RemoteFlights],
         total: int,
         *,
         unit: str = "updates",
@@ -87,19 +93,22 @@ class Journal:
     def __enter__(self) -> Journal:
         """Go on from the checkpoint, if there is one, and start the progress bar."""
         self._restore()
+        distributed.broadcast(self._weights())
         self._began = self._saved_at = self._noted_at = time.monotonic()
         self.progress = Progress(self.settings.name, self.total, unit=self.unit, done=self.count)
         self._note_status("training")
         for callback in self.callbacks:
             callback.on_start(self.policies)
-        self.progress.__enter__()
+        if distributed.is_first():
+            self.progress.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Stop progress bar and flights; unless something went wrong, write the last checkpoint."""
-        self.progress.__exit__(kind, error, trace)
+        if distributed.is_first():
+            self.progress.__exit__(kind, error, trace)
         try:
             if kind is None:
                 self._save_best()
@@ -122,18 +131,22 @@ class Journal:
         """
         interruption = self.session.interruption
         advice = "Stopping after this round, with a checkpoint; once more stops at once, without one."
-        with interruption.deferred(advice):
+        with interruption.deferred(advice if distributed.is_first() else ""):
             while first + self.round <= last and not self._wants_to_stop:
                 self.step = first + self.round
                 yield self.step
                 self.round += 1
                 if self.round % BEST_ROUNDS == 0:
                     self._save_best()
-                if interruption.is_asked_for:
+                asked, is_due, self._wants_to_stop = distributed.any_of(
+                    interruption.is_asked_for, self._is_due, self._wants_to_stop
+                )
+                if asked:
                     self._save(last=True)
                     self._note_status("stopped")
                     interruption.check()
-                if self._is_due:
+                    raise Stopped(signal.SIGTERM)  # it was another process that was asked
+                if is_due:
                     self._save()
 
     def show(self, flights: TensorDictBase) -> TensorDictBase:
@@ -154,6 +167,16 @@ class Journal:
             figures: what the progress bar shows.
         """
         self.count += count
+        metrics, scores = distributed.mean(metrics), distributed.mean(scores)
+        if distributed.is_first():
+            self._record(metrics, count, scores, {name: metrics.get(name, value) for name, value in figures.items()})
+        wishes = [callback.on_round(self.step, metrics) for callback in self.callbacks]  # all are called
+        self._wants_to_stop = any(wishes)
+
+    def _record(
+        self, metrics: Mapping[str, float], count: int, scores: Mapping[str, float], figures: Mapping[str, float | str]
+    ) -> None:
+        """Write the metrics of this round wherever they are looked at; see `note`."""
         for name, score in scores.items():
             self._scores.setdefault(name, []).extend([score] if math.isfinite(score) else [])
         self._unwritten.append((self.step, dict(metrics)))
@@ -163,8 +186,6 @@ class Journal:
         self._noted_at = now
         self.session.dashboards.log(self.step, {**metrics, **speed})
         self.progress.update(count, **figures)
-        wishes = [callback.on_round(self.step, metrics) for callback in self.callbacks]  # all are called
-        self._wants_to_stop = any(wishes)
 
     def _write_metrics(self, *, last: bool = False) -> None:
         """Append what is not yet written to ``metrics.jsonl``; where that fails, try again after the next round."""
@@ -177,8 +198,9 @@ class Journal:
 
     def _save(self, *, last: bool = False) -> None:
         """Write a checkpoint of this round, unless there is one; where that fails, try again later."""
+        distributed.check_alike(self._weights(), f"after round {self.round}")
         self._write_metrics(last=last)
-        if self._saved == self.round:
+        if self._saved == self.round or not distributed.is_first():
             return
         began = time.monotonic()
         try:
@@ -195,13 +217,13 @@ class Journal:
 
     @property
     def _is_due(self) -> bool:
-        """Whether it is time for the next checkpoint."""
+        """Whether it is time for the next checkpoint; it is the first process that writes them."""
         period = 60 * self.settings.checkpoint_minutes
-        return period == 0 or time.monotonic() - self._saved_at > max(period, self._cost)
+        return distributed.is_first() and (period == 0 or time.monotonic() - self._saved_at > max(period, self._cost))
 
     def _save_best(self) -> None:
         """Write the policies whose mean score in the last rounds is the best so far."""
-        for name, scores in self._scores.items():
+        for name, scores in self._scores.items() if distributed.is_first() else ():
             score = sum(scores) / len(scores) if scores else math.inf
             scores.clear()
             if score >= self._best.get(name, math.inf):
@@ -217,6 +239,11 @@ class Journal:
     def _parts(self, *, with_flocks: bool = True) -> dict[str, Part]:
         flocks = {f"flocks-{name}": group for name, group in self.flocks.items()} if with_flocks else {}
         return {**self.learners, **flocks}
+
+    def _weights(self) -> list[Tensor]:
+        """All that the learners hold."""
+        groups = [group for learner in self.learners.values() for group in learner.state()[0].values()]
+        return [value for group in groups for value in group.values()]
 
     def _values(self) -> dict[str, Any]:
         """What a checkpoint holds of the run itself."""
@@ -236,19 +263,22 @@ class Journal:
     def _restore(self) -> None:
         """Go on from the session's checkpoint, or begin."""
         checkpoint = self.session.checkpoint
+        first = distributed.is_first()
         if checkpoint is None:
-            self.run.cut_metrics(0)
+            if first:
+                self.run.cut_metrics(0)
             return
         values = checkpoint.state
         try:
-            scatter(self._parts(with_flocks=self.session.keeps_flocks), checkpoint)
+            scatter(self._parts(with_flocks=self.session.keeps_flocks), checkpoint, with_generators=first)
             self.round = self._saved = int(values["round"])
             self.count, self.memory, self._best = int(values["count"]), values["memory"], values["best"]
             self._scores = values["scores"]
             self._seconds = float(values["seconds"])
             for name, callback in self._named_callbacks():
                 callback.restore(values["callbacks"].get(name, {}))
-            self.run.cut_metrics(int(values["metrics_bytes"]))
+            if first:
+                self.run.cut_metrics(int(values["metrics_bytes"]))
         except (KeyError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise InputError(
@@ -266,6 +296,8 @@ class Journal:
 
     def _note_status(self, state: str) -> None:
         """Write how the run stands; a disk that is full does not stop it."""
+        if not distributed.is_first():
+            return
         seconds = self._seconds + time.monotonic() - self._began
         figures: dict[str, Any] = {"round": self.round, "done": self.count, "total": self.total, "unit": self.unit}
         with contextlib.suppress(OSError):

@@ -14,6 +14,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
 
+from modgnn_rl import distributed
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ImitationConfig
 from modgnn_rl.equivariant import is_equivariant
 from modgnn_rl.modgnn import ModGNN
@@ -100,10 +101,16 @@ class Learner:
         count = max(1, round(settings.receivers * REFERENCE_SIZE / controlled.shape[-1]))
         return random_receivers(controlled, count, generator)
 
-    def step(self, loss: Tensor, batch: TensorDictBase) -> None:
-        """Take an optimiser step along the gradients that the weights hold, those of a loss on a batch."""
+    def step(self, loss: Tensor, batch: TensorDictBase, receivers: Tensor) -> None:
+        """Take an optimiser step along the gradients that the weights hold, those of a loss on a batch.
+
+        Args:
+            loss: the mean over its receivers.
+            batch: windows [S, W].
+            receivers: the agents that count, bool [S, N].
+        """
         self.updates_done += 1
-        if self.stepper.step(self.updates_done, loss, batch):
+        if self.stepper.step(self.updates_done, loss, batch, receivers.sum()):
             self.scheduler.step()
             self.averaged.update_parameters(self.policy)
 
@@ -188,18 +195,19 @@ def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int
             for loss in losses:
                 loss.backward()
         for learner, loss in zip(learners, losses, strict=True):
-            learner.step(loss, batch)
+            learner.step(loss, batch, receivers)
         records.append(torch.stack([loss.detach() for loss in losses]))
     return torch.stack(records).nanmean(0).tolist() if records else [math.nan] * len(learners)
 
 
 @torch.no_grad()
 def validate_together(learners: Sequence[Learner], buffer: ReplayBuffer) -> list[float]:
-    """The loss of the averaged policy of each learner, on one batch of held-out data."""
+    """The loss of the averaged policy of each learner, on one batch of held-out data of each process."""
     batch = buffer.sample()
     first = learners[0]
     receivers = first.prepare(batch, first.validating, turn=any(learner.turns for learner in learners))
-    return [float(imitation_loss(learner.flown, batch, receivers)) for learner in learners]
+    losses = [float(imitation_loss(learner.flown, batch, receivers)) for learner in learners]
+    return list(distributed.mean(dict(enumerate(losses))).values())
 
 
 def cosine_learning_rate(step: int, rates: Sequence[float], updates: tuple[int, int]) -> float:

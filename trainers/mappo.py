@@ -5,7 +5,7 @@ from __future__ import annotations
 from modgnn_rl.configs.schema import MAPPOConfig
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.seeds import derive_seed
-from modgnn_rl.trainers.collection import FlockCollector, flocks_of, named_flocks
+from modgnn_rl.trainers.collection import flocks_of, make_flights, named_flocks
 from modgnn_rl.trainers.journal import Journal
 from modgnn_rl.trainers.measures import flight_metrics, reward_metrics
 from modgnn_rl.trainers.ppo import Improver
@@ -33,7 +33,8 @@ def mappo(session: Session) -> dict[str, ModGNN]:
     learner = Improver(initial_policy(config), settings, world.state_key, config.seed)
     name = config.model.name
     flocks = {
-        size: FlockCollector(
+        size: make_flights(
+            config.collector,
             world,
             flocks_of(size, config),
             size,

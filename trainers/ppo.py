@@ -13,6 +13,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacem
 from torchrl.modules import PopArtValueNorm, set_recurrent_mode
 from torchrl.objectives import MAPPOLoss, ValueEstimators
 
+from modgnn_rl import distributed
 from modgnn_rl.configs.schema import REFERENCE_SIZE, MAPPOConfig
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.seeds import derive_seed, seeded
@@ -70,6 +71,15 @@ class AnchoredMAPPOLoss(MAPPOLoss):
         return losses
 
 
+class SharedValueNorm(PopArtValueNorm):
+    """TorchRL's `PopArtValueNorm` over the batches of all processes, which are equally large."""
+
+    def update(self, value_target: Tensor) -> None:
+        """Fold in a batch of value targets [*B, 1] of each process."""
+        super().update(value_target)
+        distributed.average(self.running_mean, self.running_mean_sq)
+
+
 def improvement_window(policy: ModGNN, settings: MAPPOConfig) -> tuple[int, int]:
     """Burn-in and length of the windows that a policy is improved on, in steps.
 
@@ -105,7 +115,7 @@ class Improver:
         self.loss = AnchoredMAPPOLoss(
             self.actor,
             self.critic,
-            value_norm=PopArtValueNorm(beta=0.995, device=device),
+            value_norm=SharedValueNorm(beta=0.995, device=device),
             clip_epsilon=settings.clip,
             entropy_coeff=settings.entropy,
             normalize_advantage=False,  # done over whole flights, and over agents that are flown
@@ -155,8 +165,8 @@ class Improver:
         self.loss.value_estimator(judged)
         controlled = flights["agents", "controlled"].unsqueeze(-1)
         advantage = judged["agents", "advantage"]
-        counted = advantage[controlled]
-        flights["agents", "advantage"] = (advantage - counted.mean()) / counted.std().clamp(min=1e-6)
+        mean, deviation = distributed.mean_and_std(advantage[controlled])
+        flights["agents", "advantage"] = (advantage - mean) / deviation.clamp(min=1e-6)
         flights["agents", "value_target"] = judged["agents", "value_target"]
         if self.loss.anchor_coeff > 0:
             with set_recurrent_mode(True):
@@ -214,7 +224,7 @@ class Improver:
         self.optimizer.zero_grad()
         loss.backward()
         self.updates_done += 1
-        if self.stepper.step(self.updates_done, loss, batch) and not only_critic:
+        if self.stepper.step(self.updates_done, loss, batch, chosen.sum()) and not only_critic:
             self.averaged.update_parameters(self.policy)
         names = ("loss_objective", "loss_critic", "loss_anchor", "clip_fraction", "kl_approx", "entropy")
         return {name: losses[name].detach().mean() for name in names if name in losses}

@@ -46,8 +46,13 @@ def gather(parts: Mapping[str, Part]) -> tuple[Tensors, dict[str, Any]]:
     return tensors, values
 
 
-def scatter(parts: Mapping[str, Part], checkpoint: Checkpoint) -> None:
+def scatter(parts: Mapping[str, Part], checkpoint: Checkpoint, *, with_generators: bool = True) -> None:
     """Give parts their states back; the first is the one that was first in `gather`.
+
+    Args:
+        parts: by name.
+        checkpoint: what `gather` gave.
+        with_generators: whether to draw on as well, or anew.
 
     Raises:
         KeyError: the checkpoint holds no state of a part.
@@ -55,9 +60,10 @@ def scatter(parts: Mapping[str, Part], checkpoint: Checkpoint) -> None:
     """
     for own, part in _prefixed(parts):
         part.restore(_under(own, checkpoint.tensors), _under(own, checkpoint.state))
-        drawn = _under(own, checkpoint.tensors["generators"])
-        for name, generator in part.generators.items():
-            generator.set_state(drawn[name])
+        if with_generators:
+            drawn = _under(own, checkpoint.tensors["generators"])
+            for name, generator in part.generators.items():
+                generator.set_state(drawn[name])
 
 
 def _prefixed(parts: Mapping[str, Part]) -> list[tuple[str, Part]]:

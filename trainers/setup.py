@@ -23,9 +23,10 @@ from modgnn_rl.models import configured_model
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.seeds import derive_seed
-from modgnn_rl.trainers.collection import window_of
+from modgnn_rl.trainers.collection import flocks_of, window_of
 from modgnn_rl.trainers.learner import Learner
 from modgnn_rl.trainers.ppo import improvement_window
+from modgnn_rl.trainers.remote import check_collector
 
 __all__ = ["DART_PARTS", "check_training", "initial_policy", "make_learner", "settle_model", "side_by_side"]
 
@@ -154,6 +155,7 @@ def check_training(config: TrainConfig) -> None:
             raise InputError(f"model.name={member.model.name} with model.hops={member.model.hops} has nothing to learn")
     _check_flights(settings, policies)
     for size in sizes:
+        check_collector(config.collector, flocks_of(size, config))
         with contextlib.closing(FlockingEnv(1, size, config=config.env, seed=config.seed)) as env:
             env.reset()
     if isinstance(settings, BCConfig) and settings.dataset:

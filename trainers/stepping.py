@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from modgnn_rl import distributed
 from modgnn_rl.configs.schema import TrainerConfig
 from modgnn_rl.errors import NotFinite
 
@@ -33,13 +34,14 @@ class Stepper:
         self.gradient_norm = 0.0
         self._in_a_row = 0
 
-    def step(self, update: int, loss: Tensor, batch: TensorDictBase) -> bool:
-        """Take one step along the gradients that the parameters hold.
+    def step(self, update: int, loss: Tensor, batch: TensorDictBase, weight: Tensor) -> bool:
+        """Take one step along the gradients that the parameters hold, or their mean where several processes train.
 
         Args:
             update: its number, for messages.
             loss: that they are the gradients of.
             batch: that it is the loss on.
+            weight: agents that count in it, [].
 
         Returns:
             whether it was taken.
@@ -48,8 +50,9 @@ class Stepper:
             NotFinite: loss or gradient is not finite, and ``trainer.on_nonfinite`` is ``stop``, or too many were.
         """
         groups = [group["params"] for group in self.optimizer.param_groups]
+        mean_loss = distributed.reduce_gradients([p for group in groups for p in group], loss, weight)
         norms = [nn.utils.get_total_norm([p.grad for p in group if p.grad is not None]) for group in groups]
-        if torch.stack([*norms, loss.detach()]).isfinite().all():
+        if torch.stack([*norms, mean_loss]).isfinite().all():
             for group, norm in zip(groups, norms, strict=True):  # not before: it would spread what is not finite
                 nn.utils.clip_grads_with_norm_(group, self.settings.max_gradient, norm)
             self.gradient_norm = float(torch.stack(norms).max())
@@ -57,12 +60,15 @@ class Stepper:
             self.optimizer.step()
             return True
         self._in_a_row += 1
-        reason = f"update {update} was not made, {blame(loss, batch, self.module)}"
+        found = distributed.texts(blame(loss, batch, self.module))
+        # After the reduction all have the gradient that is not finite, only one has the data.
+        reason = f"update {update} was not made, {min(found, key=lambda text: 'gradient' in text)}"
         if self.settings.on_nonfinite == "stop":
             raise NotFinite(f"{reason}; trainer.on_nonfinite=skip goes on without such updates")
         if self._in_a_row >= PATIENCE:
             raise NotFinite(f"{reason}, nor were the {PATIENCE - 1} before it; resume with smaller steps")
-        warnings.warn(f"{reason}; training goes on", RuntimeWarning, stacklevel=2)
+        if distributed.is_first():
+            warnings.warn(f"{reason}; training goes on", RuntimeWarning, stacklevel=2)
         return False
 
 

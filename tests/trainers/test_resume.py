@@ -11,7 +11,15 @@ import torch
 
 from modgnn_rl import load_policy, training
 from modgnn_rl.checkpoint import load_checkpoint
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
+from modgnn_rl.configs.schema import (
+    BCConfig,
+    CollectorConfig,
+    DAggerConfig,
+    FlockingConfig,
+    MAPPOConfig,
+    ModelConfig,
+    TrainConfig,
+)
 from modgnn_rl.errors import InputError
 from modgnn_rl.interruption import Stopped
 from modgnn_rl.run_folder import RunFolder
@@ -173,3 +181,16 @@ def test_a_run_that_fails_leaves_the_policies_of_before(tmp_path):
     resume(run.path)
     assert run.state == "finished"
     assert "reason" not in run.status
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["process", "ray"])
+@pytest.mark.parametrize("name", ["dagger of two sizes in bad weather", "dagger with an ensemble", "mappo"])
+def test_a_stopped_run_of_workers_ends_as_one_that_was_not(tmp_path, name, kind):
+    if kind == "ray":
+        pytest.importorskip("ray")
+    settings = {**RUNS[name], "collector": CollectorConfig(kind, workers=2)}
+    straight = train(_config(tmp_path / "straight", **settings))
+    run = _stop(tmp_path / "stopped", at=2, **settings)
+    resume(run.path)
+    _assert_equal(_all_of(straight), _all_of(run))

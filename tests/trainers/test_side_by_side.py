@@ -175,7 +175,7 @@ def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settin
 
     def watched(self, flights):
         keep(self, flights)
-        seen.append((self.env.batch_size[0], flights.shape[1], self.seen))
+        seen.append((*flights.shape, self.seen))
 
     monkeypatch.setattr(Flocks, "keep", watched)
     train(_config(tmp_path, cloning_updates=rounds, every=1, noise=0.2, **settings))

@@ -13,6 +13,8 @@ from modgnn_rl.configs.schema import DAggerConfig
 from modgnn_rl.errors import NotFinite
 from modgnn_rl.trainers.stepping import PATIENCE, Stepper
 
+ALL = torch.tensor(12)  # agents that count in a batch
+
 
 def _batch():
     agents = TensorDict({"observation": torch.randn(4, 2, 3, 6), "controlled": torch.ones(4, 2, 3, dtype=torch.bool)})
@@ -63,7 +65,7 @@ def test_a_finite_gradient_is_clipped_and_stepped_along():
     loss = _backward(model, batch)
     norm = torch.cat([p.grad.flatten() for p in model.parameters()]).norm()
     before = torch.cat([p.detach().flatten() for p in model.parameters()])
-    assert stepper.step(1, loss, batch)
+    assert stepper.step(1, loss, batch, ALL)
     moved = (torch.cat([p.detach().flatten() for p in model.parameters()]) - before).norm()
     assert stepper.gradient_norm == pytest.approx(float(norm))
     assert float(moved) == pytest.approx(min(0.5, float(norm)), rel=1e-4)
@@ -78,10 +80,10 @@ def test_no_step_is_taken_and_what_is_wrong_is_named(message, on_nonfinite):
     before = {name: value.clone() for name, value in model.state_dict().items()}
     if on_nonfinite == "stop":
         with pytest.raises(NotFinite, match=f"update 7 was not made, since {message}"):
-            stepper.step(7, loss, batch)
+            stepper.step(7, loss, batch, ALL)
     else:
         with pytest.warns(RuntimeWarning, match=message):
-            assert not stepper.step(7, loss, batch)
+            assert not stepper.step(7, loss, batch, ALL)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
 
@@ -91,10 +93,10 @@ def test_too_many_in_a_row_stop_and_one_good_one_counts_anew():
     def skip(times):
         for _ in range(times):
             with pytest.warns(RuntimeWarning, match="training goes on"):
-                stepper.step(1, _spoil_gradient(model, _batch()), _batch())
+                stepper.step(1, _spoil_gradient(model, _batch()), _batch(), ALL)
 
     skip(PATIENCE - 1)
-    assert stepper.step(1, _backward(model, _batch()), _batch())
+    assert stepper.step(1, _backward(model, _batch()), _batch(), ALL)
     skip(PATIENCE - 1)
     with pytest.raises(NotFinite, match="resume with smaller steps"):
-        stepper.step(1, _spoil_gradient(model, _batch()), _batch())
+        stepper.step(1, _spoil_gradient(model, _batch()), _batch(), ALL)

@@ -1,0 +1,112 @@
+"""Where the time of a training run goes: ``python benchmarks/training_profile.py`` profiles the default run.
+
+Takes the settings of ``python -m modgnn_rl.train``, as in ``trainer.rounds=20 logger=tensorboard``. A line is the time
+without that of other lines, on the clock and on the processor; where they differ, this process waited for others or the
+disk.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from modgnn_rl.command import run_command
+from modgnn_rl.configs.schema import TrainConfig
+from modgnn_rl.resuming import TRAINER_SETTINGS
+
+WHOLE = ("forward", "logging", "logging: reference flights, once", "evaluation")
+
+
+class Clock:
+    """Adds up how long each part takes, without the parts inside it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(2))  # on the clock, on the processor
+        self._parts: list[str] = ["the rest"]
+        self._since = _now()
+
+    def watch(self, owner: Any, name: str, part: str) -> None:
+        """Count the calls of a function as a part; inside one of `WHOLE` they count as that."""
+        function = getattr(owner, name)
+
+        def timed(*arguments: Any, **options: Any) -> Any:
+            self._switch(self._parts[-1] if self._parts[-1] in WHOLE else part)
+            try:
+                return function(*arguments, **options)
+            finally:
+                self._switch(None)
+
+        setattr(owner, name, timed)
+
+    def _switch(self, part: str | None) -> None:
+        now = _now()
+        self.seconds[self._parts[-1]] += now - self._since
+        self._since = now
+        if part is None:
+            self._parts.pop()
+        else:
+            self._parts.append(part)
+
+
+def _now() -> np.ndarray:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def watched() -> Clock:
+    """A clock on all that a run does."""
+    import torch
+    from torch.optim.swa_utils import AveragedModel
+    from torchrl.data import ReplayBuffer
+
+    from modgnn_rl import training
+    from modgnn_rl.envs import FlockingEnv
+    from modgnn_rl.experts import Reynolds
+    from modgnn_rl.modgnn import ModGNN
+    from modgnn_rl.trainers import learner
+    from modgnn_rl.trainers.collection import FlockCollector, Flocks
+    from modgnn_rl.trainers.journal import Journal
+    from modgnn_rl.trainers.stepping import Stepper
+    from modgnn_rl.trainers.watching import Watch
+
+    clock = Clock()
+    clock.watch(FlockingEnv, "_step", "environment: physics and graph")
+    clock.watch(FlockingEnv, "_reset", "environment: physics and graph")
+    clock.watch(Reynolds, "forward", "expert")
+    clock.watch(ModGNN, "forward", "policy, flying")
+    clock.watch(FlockCollector, "continue_flights", "collector")
+    clock.watch(Flocks, "keep", "data: windows into the buffer")
+    clock.watch(ReplayBuffer, "sample", "batch assembly")
+    clock.watch(learner.Learner, "prepare", "batch assembly")
+    clock.watch(learner, "imitation_loss", "forward")
+    clock.watch(torch.Tensor, "backward", "backward")
+    clock.watch(Stepper, "step", "optimiser and moving average")
+    clock.watch(AveragedModel, "update_parameters", "optimiser and moving average")
+    clock.watch(Journal, "_record", "logging")
+    clock.watch(Watch, "on_round", "logging")
+    clock.watch(Watch, "on_flights", "logging")
+    clock.watch(Watch, "on_start", "logging: reference flights, once")
+    clock.watch(Journal, "_save", "checkpoints")
+    clock.watch(Journal, "_save_best", "checkpoints")
+    clock.watch(training, "evaluate_policies", "evaluation")
+    return clock
+
+
+def main(config: TrainConfig) -> None:
+    """Train, and print where the time went; the evaluation at the end is not counted."""
+    from modgnn_rl.training import train
+
+    clock = watched()
+    train(config)
+    clock.seconds.pop("evaluation")
+    total = np.sum(list(clock.seconds.values()), axis=0)
+    print("\n| part | clock, s | share | processor, s | share |\n|---|---:|---:|---:|---:|")
+    for part, seconds in sorted([*clock.seconds.items(), ("all", total)], key=lambda entry: -entry[1][1]):
+        (wall, busy), (wall_share, share) = seconds, seconds / total
+        print(f"| {part} | {wall:.1f} | {wall_share:.1%} | {busy:.1f} | {share:.1%} |")
+
+
+if __name__ == "__main__":
+    run_command(main, TrainConfig, "train", nodes={f"trainer/{name}": kind for name, kind in TRAINER_SETTINGS.items()})

@@ -1,0 +1,128 @@
+"""A list of runs: how each stands, with its main figures."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import textwrap
+from collections.abc import Callable, Collection, Sequence
+from datetime import datetime
+
+from modgnn_rl.run_summary import METRICS, RunSummary
+from modgnn_rl.text_tables import aligned, as_figure, as_span, markdown, printable
+
+__all__ = ["list_runs", "next_steps", "sort_key", "state_of"]
+
+ENDED = ("stopped", "killed", "failed")  # before their time
+LABELS = {"validation_loss": "loss"}
+LESS_IMPORTANT = ("speed", "age", "took", "leader", "best")  # columns that go where there is no room, in this order
+SHORTEST_NAME = 24
+LEGEND = (
+    "took: time trained; last: error of the actions on own flights (m^2/s^2), loss on held-out flights, or reward of a "
+    "step, in the last round; best: its best mean over 5 rounds; eval.: error in the evaluation; leader: distance from "
+    "the leader there, m"
+)
+
+
+def list_runs(runs: Sequence[RunSummary], width: int | None = None) -> str:
+    """A table with a row for each run, what is wrong with some, and what to do next.
+
+    Args:
+        runs: in the order of the rows.
+        width: where there is less room, columns go and names are shortened; default: all, as Markdown.
+    """
+    if not runs:
+        return "No runs to list.\nNext: python -m modgnn_rl.train begins one"
+    rows = [row for run in runs for row in (run, *run.policies)]
+    columns = _columns({policy.path for run in runs for policy in run.policies})
+    cells = {header: [header, *map(cell, rows)] for header, cell in columns.items()}
+    if width is None:
+        table = markdown(list(zip(*cells.values(), strict=True)))
+    else:
+        for header in LESS_IMPORTANT:
+            if _excess(cells, width) > 0:
+                del cells[header]
+        longest = max(map(len, cells["run"])) - max(0, _excess(cells, width))
+        cells["run"] = [_shortened(name, max(SHORTEST_NAME, longest)) for name in cells["run"]]
+        table = aligned(list(zip(*cells.values(), strict=True)))
+    notes = [printable(f"{run.name}: {note}") for run in runs if (note := run.problem or run.reason)]
+    parts = [table, "\n".join(notes), textwrap.fill(LEGEND, width or 120), "\n".join(next_steps(runs))]
+    return "\n\n".join(part for part in parts if part)
+
+
+def sort_key(run: RunSummary, sort: str) -> tuple[float, str]:
+    """What runs are sorted by, so that the newest, the longest or the best is last; first those of which it is unknown.
+
+    Args:
+        run: a run.
+        sort: as `modgnn_rl.configs.schema.RunsConfig` lists it.
+    """
+    if sort in ("started", "updated"):
+        time = run.started if sort == "started" else run.updated
+        rank = time.timestamp() if time else None
+    elif sort == "seconds":
+        rank = run.seconds
+    elif sort == "reward":
+        rank = run.last.get(sort)
+    else:
+        error = _evaluated(run, "error") if sort == "evaluation" else run.last.get(sort)
+        rank = None if error is None else -error
+    return -math.inf if rank is None else rank, run.path.name
+
+
+def next_steps(runs: Sequence[RunSummary]) -> list[str]:
+    """How to go on with the last of those that ended before their time."""
+    ended = list(dict.fromkeys(run.run for run in runs if run.state in ENDED))
+    if not ended:
+        return []
+    others = [f"{len(ended) - 1} more can be resumed like this."] if len(ended) > 1 else []
+    return [f"Next: python -m modgnn_rl.train {shlex.quote(f'resume={ended[-1]}')}", *others]
+
+
+def state_of(run: RunSummary) -> str:
+    """The state, with how much is done of what is not finished."""
+    return f"{run.state} {run.share:.0%}" if run.share is not None and run.state in ("training", *ENDED) else run.state
+
+
+def _columns(policies: Collection[object]) -> dict[str, Callable[[RunSummary], str]]:
+    """The cells of a row by header; what several policies have in common stands in their run's row only."""
+
+    def shared(cell: Callable[[RunSummary], str]) -> Callable[[RunSummary], str]:
+        return lambda run: "" if run.path in policies else cell(run)
+
+    now = datetime.now().astimezone()
+    return {
+        "run": lambda run: f"  {run.path.name}" if run.path in policies else run.name,
+        "state": shared(state_of),
+        "age": shared(lambda run: as_span((now - run.updated).total_seconds() if run.updated else None)),
+        "took": shared(lambda run: as_span(run.seconds)),
+        "last": _last_figure,
+        "best": lambda run: as_figure(run.best),
+        "eval.": lambda run: as_figure(_evaluated(run, "error")),
+        "leader": lambda run: as_figure(_evaluated(run, "leader_distance")),
+        "speed": shared(lambda run: f"{as_figure(run.speed)} {run.unit}/s" if run.speed else "-"),
+    }
+
+
+def _last_figure(run: RunSummary) -> str:
+    """The last figure of what the trainer aims at, or of what else there is."""
+    metric = next((name for name in (run.aim, *METRICS) if name in run.last), None)
+    return "-" if metric is None else f"{LABELS.get(metric, metric)} {as_figure(run.last[metric])}"
+
+
+def _evaluated(run: RunSummary, metric: str) -> float | None:
+    """The mean of a metric in flights of the size and in the world trained on; of another size if there are none."""
+    tables = [table for size in run.sizes if (table := run.evaluations.get(f"{size} agents"))]
+    tables += [table for name, table in run.evaluations.items() if "," not in name]
+    spread = tables[0][metric] if tables else None
+    return spread["mean"] if spread else None
+
+
+def _excess(cells: dict[str, list[str]], width: int) -> int:
+    """By how much a table is too wide."""
+    return sum(max(map(len, column)) + 2 for column in cells.values()) - 2 - width
+
+
+def _shortened(name: str, length: int) -> str:
+    """A name without its middle: it begins with the date and ends with what the run is called."""
+    return name if len(name) <= length else f"{name[: length // 3]}...{name[len(name) - (length - length // 3 - 3) :]}"

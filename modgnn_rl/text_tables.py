@@ -1,0 +1,46 @@
+"""Tables of text, aligned for a terminal or as Markdown, and figures in their cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+__all__ = ["aligned", "as_figure", "as_span", "markdown", "printable"]
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """A table whose columns are kept apart by two spaces; the first row is the header."""
+    return "\n".join("  ".join(cells).rstrip() for cells in _padded(rows))
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; the first row is the header."""
+    lines = [f"| {' | '.join(cells)} |" for cells in _padded([[c.replace("|", "\\|") for c in row] for row in rows])]
+    lines.insert(1, "".join("|" if letter == "|" else "-" for letter in lines[0].replace("\\|", "--")))
+    return "\n".join(lines)
+
+
+def as_figure(value: float | None) -> str:
+    """A number with three digits; ``-`` where there is none."""
+    return "-" if value is None else f"{value:.3g}"
+
+
+def as_span(seconds: float | None) -> str:
+    """A time, s, in the unit that suits it; ``-`` where there is none."""
+    if seconds is None:
+        return "-"
+    for unit, length, most in (("s", 1, 100), ("min", 60, 100), ("h", 3600, 48)):
+        if seconds < most * length:
+            return f"{seconds / length:.2g} {unit}"
+    return f"{seconds / 86400:.2g} d"
+
+
+def printable(text: str) -> str:
+    """Text on one line, without what moves a terminal's cursor."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def _padded(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    """The cells, cleaned, as wide as their columns."""
+    clean = [[printable(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*clean, strict=True)]
+    return [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in clean]
