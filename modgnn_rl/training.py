@@ -22,13 +22,8 @@ from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingC
 from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation import evaluate
 from modgnn_rl.interruption import Interruption
-<<<<<<< HEAD
 from modgnn_rl.loading import changed_world, load_policy
-from modgnn_rl.loggers import check_logger, make_logger
-=======
-from modgnn_rl.loading import load_policy, stored_world
 from modgnn_rl.loggers import Dashboards, check_logger, make_logger
->>>>>>> d010b554a4e1ba53d5399ae8ba68c792586097fc
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.recording import Recorder, spacing
 from modgnn_rl.replay_page import write_replay
