@@ -1,8 +1,8 @@
 """Recordings of a flight as one HTML file that plays them, without a network and without anything installed.
 
-The page, ``replay.html``, holds each recording as a gzip stream in base64. Numbers change little from step to step: kept
-are the second differences of positions and the first ones of velocities, zigzag coded (0, -1, 1, -2, ... as 0, 1, 2, 3,
-...), one plane for each byte. Links are found anew from positions; kept are those that the radio had otherwise.
+The page, ``replay.html``, holds each recording as a gzip stream in base64. Numbers change little from step to step:
+kept are the second differences of positions and the first ones of velocities, zigzag coded (0, -1, 1, -2, ... as 0, 1,
+2, 3, ...), one plane for each byte. Links are found anew from positions; kept are those that the radio had otherwise.
 """
 
 from __future__ import annotations

@@ -47,7 +47,9 @@ def write_picture(path: str | os.PathLike[str], flights: Mapping[str, Recording]
             axes = figure.add_subplot(1, len(flights), column + 1)
             axes.set_axis_off()
             axes.set_aspect("equal")
-            axes.set_title(f"{name}, {step * flight.every / flight.frequency:.1f} s", fontsize=11, color=COLOURS["agent"])
+            axes.set_title(
+                f"{name}, {step * flight.every / flight.frequency:.1f} s", fontsize=11, color=COLOURS["agent"]
+            )
             drawn.append((axes, _draw(axes, flight, step)))
         reach = 1.04 * max(float(reach) for _, reach in drawn)
         for axes, _ in drawn:

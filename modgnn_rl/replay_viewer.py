@@ -39,7 +39,9 @@ class Viewer:
         try:
             import viser
         except ImportError as error:
-            raise InputError("viewer=true needs viser, which is not installed: pip install 'modgnn-rl[viewer]'") from error
+            raise InputError(
+                "viewer=true needs viser, which is not installed: pip install 'modgnn-rl[viewer]'"
+            ) from error
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
@@ -59,7 +61,9 @@ class Viewer:
 
     def __enter__(self) -> Self:
         """Say where to look, and wait a while for somebody to do so."""
-        print(f"Watch at {self.url}; the flight begins when a browser is there, or in {self.patience:.0f} s", flush=True)
+        print(
+            f"Watch at {self.url}; the flight begins when a browser is there, or in {self.patience:.0f} s", flush=True
+        )
         end = time.monotonic() + self.patience
         while not self.server.get_clients() and time.monotonic() < end:
             time.sleep(0.1)

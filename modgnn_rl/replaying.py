@@ -67,9 +67,7 @@ def replay_run(config: ReplayConfig) -> Path:
         else:
             write_replay(path, recordings, f"{run.path.name}: {name}", facts)
     except OSError as error:
-        raise InputError(
-            f"cannot write {path} ({error.strerror}); give output=<a file that you can write>"
-        ) from error
+        raise InputError(f"cannot write {path} ({error.strerror}); give output=<a file that you can write>") from error
     return path
 
 
