@@ -24,9 +24,9 @@ FARTHEST = 2**28  # quanta; who is farther away is drawn there
 MOST_STATES = 200_000  # agents x steps of a flight that are kept unless somebody asks for more
 METRICS = {
     "error": ("Error against the expert", "m²/s²"),
-    "leader_distance": ("Leader to the centre of the others", "m"),
-    "cohesion": ("Cohesion: diameter of the flock", "m"),
-    "separation": ("Separation: nearest neighbour, mean", "m"),
+    "leader_distance": ("Leader to the others' centre", "m"),
+    "cohesion": ("Cohesion: diameter", "m"),
+    "separation": ("Separation: nearest neighbour", "m"),
 }
 
 
@@ -64,9 +64,9 @@ class Recording:
         return np.setxor1d(near, self.flips[index], assume_unique=True)
 
 
-def spacing(num_agents: int, steps: int) -> int:
-    """Steps from one that is kept to the next, so that a recording stays small."""
-    return -(-num_agents * steps // MOST_STATES)
+def spacing(num_agents: int, steps: int, frames: int | None = None) -> int:
+    """Steps from one that is kept to the next, so that a recording stays small, or has about so many frames at most."""
+    return max(-(-num_agents * steps // MOST_STATES), -(-steps // (frames or steps)))
 
 
 def links_in_range(position: Array, present: Array, comm_range: float) -> Array:

@@ -41,6 +41,7 @@ from modgnn_rl.trainers.watching import Watch, log_evaluation
 
 __all__ = ["TRAINERS", "evaluate_policies", "evaluate_run", "prepare_torch", "resume", "train"]
 
+REPLAY_FRAMES = 250  # of the replay beside a table: keeping more would take longer than a second
 TRAINERS = {"bc": bc, "dagger": dagger, "mappo": mappo}
 
 
@@ -209,7 +210,7 @@ def evaluate_policies(
     """
     tables, replays = {}, {}
     for size in sizes:
-        every = spacing(size, settings.steps)
+        every = spacing(size, settings.steps, REPLAY_FRAMES)
         replays[size] = {name: Recorder(world, every) for name in (*policies, "expert")}
         flights = evaluate(
             policies,
@@ -235,7 +236,7 @@ def evaluate_policies(
         page = file.with_name(file.stem.replace("evaluation", f"replay-{size}", 1) + ".html")
         recordings = {name: recorder.recording() for name, recorder in recorders.items()}
         write_replay(page, recordings, title, {"seed": settings.seed, "flock": f"1 of {settings.num_flocks}"})
-        print(f"Replay: {page}", flush=True)
+        print(f"A flight of {size} agents to watch in a browser: {page}", flush=True)
     return tables
 
 
