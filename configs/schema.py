@@ -41,6 +41,7 @@ MODEL_NAMES = (
     "moment_force",
     "pair_force",
     "modgnn_mlp",
+    "modgnn_adjacency",
     "no_pre",
     "no_mid",
     "gcn",
@@ -403,7 +404,7 @@ class TrainConfig:
     logger: Any = setting("none", "dashboards to write for beside the plain files, one or a list", choices=LOGGER_NAMES)
     wandb: WandbConfig = field(default_factory=WandbConfig)
     video_rounds: int = setting(
-        20, "logger=tensorboard or wandb: a film of a flight each so many rounds; 0: none", low=0
+        40, "logger=tensorboard or wandb: a film of a flight each so many rounds; 0: none", low=0
     )
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     resume: str | None = setting(
@@ -501,3 +502,53 @@ class RunsConfig:
         choices=("started", "updated", "seconds", "error", "reward", "validation_loss", "evaluation"),
     )
     format: str = setting("text", "how it is written", choices=("text", "markdown", "json"))
+
+
+@dataclass
+class ScaleConfig:
+    """How large a reproduction of the paper is; the defaults are ``scale=small``."""
+
+    name: str = setting("small", "what it is called in tables")
+    episodes: int = setting(200, "flights of the expert to train on", low=1)
+    steps: int = setting(500, "steps of each", low=2)
+    held_out: int = setting(32, "further flights of the expert, for the validation error", low=1)
+    updates: int = setting(6000, "updates of each cloned model", low=1)
+    batch_size: int = setting(64, "flock states in a batch", low=1)
+    flocks: int = setting(32, "fresh flocks that each policy flies", low=2)
+    flight_steps: int = setting(1000, "steps of a flight", low=4)
+    sizes: list[int] = setting([16, 32, 64], "numbers of agents that each policy is flown with (Table 3)", low=2)
+    rounds: int = setting(40, "after=dagger or mappo: rounds of DAgger", low=1)
+    iterations: int = setting(15, "after=mappo: rounds of MAPPO", low=1)
+    num_envs: int = setting(16, "after=dagger or mappo: flocks flown at once", low=1)
+    study_updates: int = setting(4000, "study=communication or layers: updates of each model", low=1)
+    study_flocks: int = setting(16, "study=...: fresh flocks that each policy flies, of 32 agents or fewer", low=2)
+    study_steps: int = setting(400, "study=...: steps of a flight", low=4)
+    study_sizes: list[int] = setting(
+        [4, 8, 16, 32, 64, 128, 256, 512, 1024], "study=size: numbers of agents that each policy is flown with", low=2
+    )
+
+
+@dataclass
+class ReproduceConfig:
+    """The paper's evaluation, and the studies beyond it."""
+
+    env: FlockingConfig = field(default_factory=FlockingConfig)
+    scale: ScaleConfig = field(default_factory=ScaleConfig)
+    seeds: int = setting(1, "trainings of each model, with other initial weights and batches each", low=1)
+    after: str = setting(
+        "cloning",
+        "what the policies have learned from: the expert's flights as in the paper, then DAgger, then MAPPO",
+        choices=("cloning", "dagger", "mappo"),
+    )
+    study: str = setting(
+        "tables",
+        "what is asked: the paper's tables, or kinds of communication, layers and hops at equal parameters, another "
+        "communication range, faults, or flock sizes, without training again where that is possible",
+        choices=("tables", "communication", "layers", "range", "faults", "size"),
+    )
+    folder: str | None = setting(
+        None, "where all goes; what is finished there is not made again; null: reproduction/<scale>"
+    )
+    seed: int = setting(0, "fixes everything that is drawn", low=0, high=2**32)
+    device: str = setting("cpu", "where to train and fly: cpu, cuda, cuda:1")
+    threads: int = setting(1, "threads of torch on the CPU; the same command in a second terminal helps more", low=0)

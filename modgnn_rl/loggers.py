@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib.metadata
 import importlib.util
-import subprocess
 import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -18,9 +16,10 @@ import torch
 from modgnn_rl.configs.schema import TrainConfig, as_list
 from modgnn_rl.dashboards import CsvFiles, Dashboard, Tensorboard, Wandb
 from modgnn_rl.errors import InputError, one_line
+from modgnn_rl.provenance import made_with
 from modgnn_rl.run_folder import RunFolder
 
-__all__ = ["Dashboards", "check_logger", "made_with", "make_logger"]
+__all__ = ["Dashboards", "check_logger", "make_logger"]
 
 PATIENCE = 13.0  # s; a dashboard that takes longer over anything is turned off
 
@@ -132,19 +131,6 @@ def make_logger(config: TrainConfig, run: RunFolder) -> Dashboards:
         "wandb": lambda: Wandb(run, about, config.wandb),
     }
     return Dashboards({name: builders[name] for name in names})
-
-
-def made_with() -> dict[str, str]:
-    """Versions of this library and of those that it rests on, and the git commit of its code where there is one."""
-    about = {name: importlib.metadata.version(name) for name in ("modgnn-rl", "torch", "torchrl", "tensordict")}
-    folder = Path(__file__).parent
-    with contextlib.suppress(OSError, subprocess.SubprocessError):
-        for command in ("ls-files --error-unmatch __init__.py", "describe --always --dirty --abbrev=40 --exclude=*"):
-            answer = subprocess.run(
-                ["git", "-C", str(folder), *command.split()], capture_output=True, text=True, check=True, timeout=5
-            )
-        about["commit"] = answer.stdout.strip()
-    return about
 
 
 def _within(seconds: float, action: Callable[[], Any]) -> Any:

@@ -1,7 +1,8 @@
 """The models: configurations of ModGNN's submodules, by name.
 
 All of them act on observations (position, velocity) [*B, N, 6] with one head, the projection onto the action ball, and
-none of them sees an absolute position: hop 0 reads the agent's velocity, the other hops differences.
+none of them sees an absolute position: hop 0 reads the agent's velocity, the other hops differences. The exception is
+``modgnn_adjacency``, there for comparison, whose communication forms no differences.
 
 With several layers, each but the last puts out features that the next ones communicate beside the observation.
 """
@@ -18,7 +19,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from modgnn_rl.central import CentralLayer
-from modgnn_rl.communication import GraphAttention, MessagePassing
+from modgnn_rl.communication import Adjacency, GraphAttention, MessagePassing
 from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
 from modgnn_rl.equivariant import VELOCITY_SCALE, Moments, PairForce, VectorSquash, mlp
 from modgnn_rl.errors import InputError
@@ -147,6 +148,13 @@ def modgnn_mlp(spec: LayerSpec) -> ModGNNLayer:
     return ModGNNLayer(spec.hops, f_pre=f_pre, f_mid=f_mid, f_final=f_final)
 
 
+def modgnn_adjacency(spec: LayerSpec) -> ModGNNLayer:
+    """ModGNN-MLP whose f_com is the adjacency: sums of the neighbours' data, not of differences, as in a plain GCN."""
+    layer = modgnn_mlp(spec)
+    layer.f_com = nn.ModuleList([Adjacency() for _ in range(spec.hops)])
+    return layer
+
+
 def no_pre(spec: LayerSpec) -> ModGNNLayer:
     """ModGNN-MLP without f_pre: the neighbours' data are summed before any network sees them."""
     f_mid = [mlp(spec.inputs, spec.hidden, LATENT) for _ in range(spec.hops + 1)]
@@ -246,6 +254,7 @@ MODELS: dict[str, Callable[[LayerSpec], ModGNNLayer | CentralLayer]] = {
     "moment_force": moment_force,
     "pair_force": pair_force,
     "modgnn_mlp": modgnn_mlp,
+    "modgnn_adjacency": modgnn_adjacency,
     "no_pre": no_pre,
     "no_mid": no_mid,
     "gcn": gcn,

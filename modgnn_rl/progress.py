@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable
@@ -107,4 +108,5 @@ class Progress:
             postfix=self._postfix(),
             bar_format=_PLAIN,
         )
-        print(line, file=self._stream, flush=True)
+        with contextlib.suppress(OSError):  # a full disk, or a reader that is gone, must not end the work
+            print(line, file=self._stream, flush=True)

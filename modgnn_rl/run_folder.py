@@ -147,9 +147,17 @@ class RunFolder:
         except OSError as error:
             raise InputError(f"cannot write into {self.path} ({error.strerror}): make the folder writable") from error
         try:
+            self._tidy()
             yield
         finally:
             lock.release()
+
+    def _tidy(self) -> None:
+        """Remove what a training that was killed left half-written; others write no such files."""
+        for pattern in (".status.json.*.tmp", ".config.yaml.*.tmp", "videos/.*.tmp.mp4"):
+            for leftover in self.path.glob(pattern):
+                with contextlib.suppress(OSError):
+                    leftover.unlink()
 
     @property
     def is_locked(self) -> bool:

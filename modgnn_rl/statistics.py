@@ -1,4 +1,4 @@
-"""Summaries over flocks with bootstrap intervals, in plain numpy.
+"""Summaries over flocks and seeds with bootstrap intervals, in plain numpy.
 
 The unit of all statistics is the flock (one episode): agents and time steps of one flock are not independent, so
 average over them first.
@@ -13,7 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from modgnn_rl.errors import InputError
 
-__all__ = ["Summary", "interquartile_mean", "paired_difference", "summarise"]
+__all__ = [
+    "Interval",
+    "Summary",
+    "interquartile_interval",
+    "interquartile_mean",
+    "paired_difference",
+    "probability_of_improvement",
+    "summarise",
+]
 
 BLOCK = 1 << 20  # values that are resampled at once
 
@@ -103,6 +111,124 @@ def interquartile_mean(values: ArrayLike) -> float:
     data = _checked(values)
     cut = data.size // 4
     return float(data[cut : data.size - cut].mean())
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A figure with its confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def interquartile_interval(
+    values: ArrayLike, *, rng: np.random.Generator, confidence: float = 0.95, resamples: int = 2000
+) -> Interval:
+    """Interquartile mean over seeds and flights, and its stratified bootstrap interval (Agarwal et al. 2021).
+
+    A resample draws seeds with replacement, and then, within each seed drawn, flights with replacement. With one seed
+    the interval tells of flights only.
+
+    Args:
+        values: ``[S, F]``, of each seed its flights; infinite values are allowed, they count as the worst.
+        rng: source of the resampling.
+        confidence: coverage of the interval, above 0 and below 1.
+        resamples: bootstrap samples, at least 1.
+
+    Raises:
+        InputError: no values, a NaN, or a setting out of range.
+    """
+    data = _checked_matrix(values)
+    lot = _Lot(rng, resamples, confidence)
+    seeds, flights = data.shape
+    drawn = data[lot.draw(seeds, (seeds, 1)), lot.draw(flights, data.shape)].reshape(resamples, -1)
+    return lot.interval(float(_middle_mean(data.reshape(1, -1))[0]), _middle_mean(drawn))
+
+
+def probability_of_improvement(
+    better: ArrayLike,
+    worse: ArrayLike,
+    *,
+    rng: np.random.Generator,
+    paired: bool = True,
+    confidence: float = 0.95,
+    resamples: int = 2000,
+) -> Interval:
+    """Probability that one policy has a lower value than another: ``P(X < Y) + P(X = Y) / 2`` (Agarwal et al. 2021).
+
+    The flights are Agarwal's tasks, the seeds the runs: where both flew the same flights, each flight is compared with
+    itself, for all pairs of seeds. The interval is that of a bootstrap over the seeds of each and over the flights.
+
+    Args:
+        better: ``[S, F]``, of each seed of the one its flights; lower is better.
+        worse: ``[T, G]``, the same of the other.
+        rng: source of the resampling.
+        paired: flight f of the one began like flight f of the other (F = G); else every flight meets every other.
+        confidence: coverage of the interval, above 0 and below 1.
+        resamples: bootstrap samples, at least 1.
+
+    Raises:
+        InputError: no values, a NaN, a setting out of range, or different flights where they should be paired.
+    """
+    x, y = _checked_matrix(better), _checked_matrix(worse)
+    if paired and x.shape[1] != y.shape[1]:
+        raise InputError(f"{x.shape[1]} and {y.shape[1]} flights cannot be paired; give values of the same flights")
+    if paired:
+        a, b, axes = x[:, None], y[None], "stf,rs,rt,rf->r"
+    else:
+        a, b, axes = x[:, None, :, None], y[None, :, None, :], "stfg,rs,rt,rf,rg->r"
+    wins = (a < b) + (a == b) / 2
+    lot = _Lot(rng, resamples, confidence)
+    shares = [lot.shares(length) for length in wins.shape]
+    return lot.interval(float(wins.mean()), np.einsum(axes, wins, *shares, optimize=True))
+
+
+@dataclass(frozen=True)
+class _Lot:
+    """Bootstrap samples, all drawn at once."""
+
+    rng: np.random.Generator
+    resamples: int
+    confidence: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.confidence < 1 or self.resamples < 1:
+            raise InputError(
+                f"confidence={self.confidence}, resamples={self.resamples}: give a confidence between 0 and 1 and "
+                "resamples >= 1"
+            )
+
+    def draw(self, length: int, shape: tuple[int, ...]) -> NDArray[np.int64]:
+        """Indices below ``length`` for each resample."""
+        return self.rng.integers(length, size=(self.resamples, *shape))
+
+    def shares(self, length: int) -> NDArray[np.float64]:
+        """How often each of ``length`` is drawn in each resample, in shares [R, length]."""
+        return self.rng.multinomial(length, np.full(length, 1 / length), size=self.resamples) / length
+
+    def interval(self, value: float, drawn: NDArray[np.float64]) -> Interval:
+        """Return a figure with the percentiles of its resamples [R]."""
+        tail = (1 - self.confidence) / 2
+        # Each end is a resample, not a mean of two: one of them may be infinite.
+        low, high = np.quantile(drawn, [tail, 1 - tail], method="nearest")
+        return Interval(value, float(low), float(high))
+
+
+def _middle_mean(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Interquartile mean of each row [R, n] -> [R]."""
+    cut = rows.shape[1] // 4
+    return np.asarray(np.sort(rows, axis=1)[:, cut : rows.shape[1] - cut].mean(1))
+
+
+def _checked_matrix(values: ArrayLike) -> NDArray[np.float64]:
+    """Return the values as float64 [S, F], or raise InputError."""
+    data = np.asarray(values, dtype=np.float64)
+    if data.ndim != 2 or data.size == 0:
+        raise InputError(f"values have shape {data.shape}; expected one row a seed and one column a flight")
+    if bad := int(np.isnan(data).sum()):
+        raise InputError(f"{bad} of {data.size} values are no numbers; count those flights as infinite, or say so")
+    return data
 
 
 def _checked(values: ArrayLike) -> NDArray[np.float64]:

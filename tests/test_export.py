@@ -376,6 +376,7 @@ def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:
     return 0
 
 
+@pytest.mark.slow
 def test_the_command_exports_what_the_example_flies(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

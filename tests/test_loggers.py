@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib.metadata
 import importlib.util
 import json
 import math
@@ -24,7 +23,7 @@ from modgnn_rl import training
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig, WandbConfig
 from modgnn_rl.dashboards import Dashboard
 from modgnn_rl.errors import InputError
-from modgnn_rl.loggers import Dashboards, check_logger, made_with, make_logger
+from modgnn_rl.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.settings import check
 from modgnn_rl.trainers.callbacks import Callback
@@ -137,17 +136,6 @@ def _without_film(dashboards):
     dashboard = next(iter(dashboards._dashboards.values()))
     dashboard.log_video = lambda *_: None
     return dashboard
-
-
-def test_what_a_run_was_made_with():
-    about = made_with()
-    assert about["torchrl"] == importlib.metadata.version("torchrl")
-    root = Path(__file__).parents[1]
-    git = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-    if git.returncode == 0:
-        assert about["commit"].removesuffix("-dirty") == git.stdout.strip()
-    else:
-        assert "commit" not in about
 
 
 def test_working_dashboards_are_passed_everything():

@@ -83,3 +83,14 @@ def test_the_standard_error_stream_is_the_default(capsys):
     out, err = capsys.readouterr()
     assert out == ""
     assert "dagger: 100%" in err
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), BrokenPipeError(32, "Broken pipe")])
+def test_what_cannot_be_written_does_not_end_the_work(error):
+    class Full(io.StringIO):
+        def write(self, text):
+            raise error
+
+    with Progress("dagger", 4, stream=Full(), every=0.0) as progress:
+        progress.update(4)
+    assert progress.done == 4

@@ -147,3 +147,16 @@ def test_write_returns_where_it_wrote(tmp_path):
     path = run.write("table.md", "| a |")
     assert path == run.path / "table.md"
     assert path.read_text() == "| a |"
+
+
+def test_half_written_files_of_a_killed_process_go_when_the_next_one_begins(tmp_path):
+    run = RunFolder.create(tmp_path, "run", "seed: 0\n")
+    (run.path / "videos").mkdir()
+    left = [run.path / ".status.json.123.tmp", run.path / "videos" / ".round_00040.123.tmp.mp4"]
+    theirs = run.path / ".evaluation.json.124.tmp"  # an evaluation may be at work meanwhile
+    for file in (*left, theirs):
+        file.touch()
+    with run.lock():
+        assert not any(file.exists() for file in left)
+        assert theirs.exists()
+    assert (run.path / "config.yaml").exists()

@@ -11,7 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.statistics import interquartile_mean, paired_difference, summarise
+from modgnn_rl.statistics import (
+    interquartile_interval,
+    interquartile_mean,
+    paired_difference,
+    probability_of_improvement,
+    summarise,
+)
 
 FLOCKS = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30)
 
@@ -90,3 +96,77 @@ def test_bad_settings_are_refused(bad: dict[str, float]) -> None:
 def test_pairs_need_equal_shapes() -> None:
     with pytest.raises(InputError, match="paired"):
         paired_difference([1.0, 2.0], [1.0], rng=rng())
+
+
+def test_the_middle_interval_has_the_width_of_theory() -> None:
+    """The 25 % trimmed mean of normal data has 1.195 times the variance of the mean (Stigler; Wilcox)."""
+    values = rng(1).normal(size=(1, 2000))
+    found = interquartile_interval(values, rng=rng(2), resamples=1500)
+    assert found.value == pytest.approx(interquartile_mean(values[0]))
+    error = np.sqrt(1.195 / 2000)
+    assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.1)
+
+
+def test_the_middle_interval_draws_seeds_and_flights_within_them() -> None:
+    """Seeds that differ while their flights do not: resamples are means over drawn seeds, of nothing in between."""
+    between = interquartile_interval(np.array([[0.0] * 50, [1.0] * 50]), rng=rng(), resamples=500)
+    assert (between.low, between.value, between.high) == (0.0, 0.5, 1.0)
+    same = interquartile_interval(np.full((3, 4), 2.5), rng=rng(), resamples=20)
+    assert (same.low, same.value, same.high) == (2.5, 2.5, 2.5)
+    # Flights that differ while seeds do not: more seeds with as many flights narrow the interval.
+    flights = rng(3).normal(size=100)
+    one, four = (interquartile_interval(np.tile(flights, (n, 1)), rng=rng(), resamples=800) for n in (1, 4))
+    assert (four.high - four.low) == pytest.approx((one.high - one.low) / 2, rel=0.25)
+
+
+def test_one_infinite_flight_does_not_move_the_middle() -> None:
+    found = interquartile_interval([[1.0, 2.0, 3.0, 4.0, np.inf, 0.0, 2.0, 3.0]], rng=rng(), resamples=200)
+    assert found.value == 2.5
+
+
+@pytest.mark.parametrize(
+    ("better", "worse", "expected"),
+    [
+        ([[0.0, 0.0]], [[1.0, 1.0]], 1.0),
+        ([[1.0, 1.0]], [[0.0, 0.0]], 0.0),
+        ([[1.0, 1.0]], [[1.0, 1.0]], 0.5),
+        ([[0.0, 10.0]], [[1.0, 11.0]], 1.0),  # each flight is compared with itself
+        ([[0.0, 2.0]], [[1.0, 1.0]], 0.5),
+        ([[0.0], [2.0]], [[1.0], [3.0]], 0.75),  # three of four pairs of seeds
+        ([[0.0], [np.inf]], [[np.inf]], 0.75),
+    ],
+)
+def test_probability_of_improvement_by_hand(
+    better: list[list[float]], worse: list[list[float]], expected: float
+) -> None:
+    found = probability_of_improvement(better, worse, rng=rng(), resamples=50)
+    assert found.value == expected
+    assert found.low <= found.value <= found.high
+    opposite = probability_of_improvement(worse, better, rng=rng(), resamples=50)
+    assert opposite.value == pytest.approx(1 - expected)
+
+
+def test_flights_of_other_worlds_all_meet() -> None:
+    found = probability_of_improvement([[0.0, 10.0]], [[1.0, 11.0, 12.0]], rng=rng(), paired=False, resamples=50)
+    assert found.value == pytest.approx(5 / 6)
+
+
+def test_probability_of_improvement_of_normal_data() -> None:
+    """P(X < Y) = Phi(d / sqrt 2) for normal data a distance d apart, with the variance of a share of flights."""
+    x, y = rng(5).normal(size=(1, 4000)), rng(6).normal(loc=1.0, size=(1, 4000))
+    found = probability_of_improvement(x, y, rng=rng(7), resamples=800)
+    wanted = statistics.NormalDist().cdf(1 / np.sqrt(2))
+    error = np.sqrt(wanted * (1 - wanted) / 4000)
+    assert found.value == pytest.approx(wanted, abs=4 * error)
+    assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.15)
+
+
+def test_bad_matrices_are_refused() -> None:
+    with pytest.raises(InputError, match="cannot be paired"):
+        probability_of_improvement([[1.0, 2.0]], [[1.0]], rng=rng())
+    with pytest.raises(InputError, match="1 of 2 values are no numbers"):
+        interquartile_interval([[1.0, float("nan")]], rng=rng())
+    with pytest.raises(InputError, match="shape"):
+        interquartile_interval([1.0, 2.0], rng=rng())
+    with pytest.raises(InputError, match="confidence"):
+        probability_of_improvement([[1.0]], [[2.0]], rng=rng(), confidence=95)

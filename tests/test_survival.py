@@ -88,22 +88,26 @@ def test_killed_at_random_moments(tmp_path, trainer):
     straight = train(_config(tmp_path / "straight", trainer))
     duration = time.monotonic() - began
     moments = random.Random(0)
+    ended = {"before its folder": 0, "before its first checkpoint": 0, "later": 0}
     for number in range(MOMENTS):
         runs = tmp_path / str(number)
         process = _start(train, _config(runs, trainer))
         time.sleep(moments.uniform(0.0, duration))
         process.kill()
         process.join()
-        if not runs.exists():  # it had not begun
-            continue
-        (folder,) = runs.iterdir()
-        if not (folder / "config.yaml").exists():
+        folder = next(runs.glob("*/config.yaml"), runs).parent
+        saved = any((folder / "checkpoints").glob("step_*[0-9]"))
+        when = "later" if saved else "before its first checkpoint" if folder.parent == runs else "before its folder"
+        ended[when] += 1
+        if when == "before its folder":
             continue
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # no checkpoint may be damaged
             run = resume(folder)
         _assert_equal(_contents(straight), _contents(run))
         assert run.state == "finished"
+    print(f"{trainer} killed", ", ".join(f"{when} {count} times" for when, count in ended.items()))
+    assert ended["later"] > MOMENTS / 4
 
 
 @pytest.mark.slow

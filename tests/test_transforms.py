@@ -93,6 +93,7 @@ def compiled(policy: ModGNN) -> nn.Module:
     return torch.compile(policy, backend="aot_eager", fullgraph=True, dynamic=False)  # type: ignore[return-value]
 
 
+@pytest.mark.slow
 def test_a_compiled_policy_runs_and_learns_from_windows() -> None:
     policy, data = make_policy(message_layer), random_window(2, STEPS)
     results = []

@@ -126,6 +126,7 @@ def is_running(process: int) -> bool:
     return listing.stdout.strip()[:1] not in ("", "Z")
 
 
+@pytest.mark.slow
 def test_workers_end_when_the_parent_is_killed(tmp_path: Path) -> None:
     parent, workers = start(tmp_path, "torch", "sleep")
     assert all(is_running(worker) for worker in workers)

@@ -218,10 +218,14 @@ def _run(runs, model, **settings):
     ("settings", "model"),
     [
         ({"gate": "disagreement", "gate_threshold": 0.3}, ModelConfig(name="pair_force", hidden=8)),
-        ({"gate": "ensemble", "gate_threshold": 0.05, "ensemble": 3}, ModelConfig(name="pair_force", hidden=8)),
+        pytest.param(
+            {"gate": "ensemble", "gate_threshold": 0.05, "ensemble": 3},
+            ModelConfig(name="pair_force", hidden=8),
+            marks=pytest.mark.slow,
+        ),
         ({"gate": "ensemble", "gate_threshold": 0.05, "ensemble": 2}, ModelConfig(name="mpnn", layers=2, hidden=8)),
         ({"replacement": "reservoir", "capacity": 20}, ModelConfig(name="pair_force", hidden=8)),
-        ({"hide_velocity": 0.5}, ModelConfig(name="modgnn_mlp", hidden=8)),
+        pytest.param({"hide_velocity": 0.5}, ModelConfig(name="modgnn_mlp", hidden=8), marks=pytest.mark.slow),
     ],
 )
 def test_a_run_of_dagger_is_fixed_by_its_seed(tmp_path, settings, model):

@@ -75,7 +75,11 @@ def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_wit
 
 
 @pytest.mark.parametrize(
-    "model", [ModelConfig(name="pair_force", hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)]
+    "model",
+    [
+        pytest.param(ModelConfig(name="pair_force", hidden=8), marks=pytest.mark.slow),
+        ModelConfig(name="mpnn", hidden=8, layers=2),
+    ],
 )
 def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, model):
     runs = []

@@ -1,0 +1,195 @@
+"""The orderings that the paper claims, and whether they hold in what was measured."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modgnn_rl.measuring import VALIDATION, Measurements
+from modgnn_rl.paper_tables import NAMES, shown
+from modgnn_rl.statistics import Interval, probability_of_improvement
+from modgnn_rl.studies import HOPS, Subject
+from modgnn_rl.tabular import Table
+
+__all__ = ["CLAIMS", "Claim", "Side", "claim_tables", "judge"]
+
+WITH_PRE, WITHOUT_PRE, BASELINES = ("modgnn_mlp", "no_mid"), ("no_pre", "gcn_final"), ("gcn", "gcn_final")
+OTHERS = ("no_mid", "no_pre", "gcn", "gcn_final")
+FIGURES = {
+    "error": "error",
+    "leader_distance": "leader distance",
+    "cohesion": "cohesion",
+    "separation_spread": "spread of separation",
+}
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a comparison: a model's figure in a world, averaged over its hops where there are several."""
+
+    model: str
+    hops: tuple[int, ...]
+    world: str = VALIDATION
+    figure: str = "error"
+
+    def __str__(self) -> str:
+        hops = (
+            "" if self.model == "central" else f", K = {' to '.join(map(str, sorted({self.hops[0], self.hops[-1]})))}"
+        )
+        agents = f", N = {self.world[1:]}" if self.world != VALIDATION else ""
+        return f"{NAMES[self.model]}{hops}{agents}"
+
+    def values(self, measurements: Measurements) -> NDArray[np.float64] | None:
+        """The figure of all flights [S, F]; None where something of it failed or was not flown."""
+        hops = (1,) if self.model == "central" else self.hops
+        found = [measurements.values(Subject(self.model, hop), self.world, self.figure) for hop in hops]
+        known = [values for values in found if values is not None]
+        same = len(known) == len(found) and len({values.shape for values in known}) == 1
+        return np.mean(known, axis=0) if same else None
+
+
+@dataclass(frozen=True)
+class Claim:
+    """An ordering, as comparisons of which each first side should have the lower figure."""
+
+    text: str
+    comparisons: tuple[tuple[Side, Side], ...]
+
+
+def _levels() -> Claim:
+    levels = (WITH_PRE, WITHOUT_PRE, ("gcn",), ("central",))
+    pairs = [pair for low, high in itertools.pairwise(levels) for pair in itertools.product(low, high)]
+    # The paper leaves out its GCN with K = 3 here, as an outlier.
+    sides = {model: Side(model, HOPS[:2] if model == "gcn" else HOPS) for pair in pairs for model in pair}
+    text = "Validation error has four levels: models with f_pre; with networks elsewhere; GCN (K = 1, 2); Central"
+    return Claim(text, tuple((sides[better], sides[worse]) for better, worse in pairs))
+
+
+def _best(text: str, figure: str, world: str, others: Sequence[str], hops: Sequence[int] = HOPS) -> Claim:
+    pairs = [
+        (Side("modgnn_mlp", (hop,), world, figure), Side(other, (hop,), world, figure))
+        for hop in hops
+        for other in others
+    ]
+    return Claim(text, tuple(pairs))
+
+
+def _more_hops() -> Claim:
+    pairs = [
+        (Side("modgnn_mlp", (more,), "N32"), Side("modgnn_mlp", (fewer,), "N32"))
+        for fewer, more in itertools.pairwise(HOPS)
+    ]
+    return Claim("ModGNN-MLP gains with K on its own flights", tuple(pairs))
+
+
+def _no_gain() -> Claim:
+    pairs = [(Side(model, (2,), "N32"), Side(model, (3,), "N32")) for model in BASELINES]
+    return Claim("The baselines do not gain with K: K = 3 is worse than K = 2 on their own flights", tuple(pairs))
+
+
+def _abroad() -> Claim:
+    pairs = [
+        (Side("modgnn_mlp", (hop,), world), Side(model, (hop,), "N32"))
+        for hop in HOPS
+        for world in ("N16", "N64")
+        for model in BASELINES
+    ]
+    return Claim("ModGNN-MLP errs less with 16 or 64 agents than the baselines do with 32", tuple(pairs))
+
+
+def _submodule(text: str, better: str, worse: str, world: str) -> Claim:
+    return Claim(text, tuple((Side(better, (hop,), world), Side(worse, (hop,), world)) for hop in HOPS))
+
+
+CLAIMS = (
+    _levels(),
+    _best("ModGNN-MLP has the lowest validation error at every K", "error", VALIDATION, (*OTHERS, "central")),
+    *(
+        _best(f"ModGNN-MLP is best on its own flights at every K: {name}", figure, "N32", (*OTHERS, "central"))
+        for figure, name in FIGURES.items()
+    ),
+    _more_hops(),
+    _no_gain(),
+    _best("ModGNN-MLP errs least with 64 agents", "error", "N64", OTHERS),
+    _best("ModGNN-MLP errs least with 16 agents at K = 2 and 3", "error", "N16", OTHERS, (2, 3)),
+    Claim(
+        "At K = 1 with 16 agents ModGNN-MLP [-f_mid] beats ModGNN-MLP",
+        ((Side("no_mid", (1,), "N16"), Side("modgnn_mlp", (1,), "N16")),),
+    ),
+    _abroad(),
+    _submodule("f_pre matters more than f_mid: validation error", "no_mid", "no_pre", VALIDATION),
+    _submodule("f_pre matters more than f_mid: error on own flights", "no_mid", "no_pre", "N32"),
+)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of one comparison; ``chance`` is None where it was not measured."""
+
+    better: Side
+    worse: Side
+    chance: Interval | None
+    means: tuple[float, float] | None
+
+    @property
+    def word(self) -> str:
+        """``holds`` and ``reversed`` where the interval lies on one side of one half, else ``undecided``."""
+        if self.chance is None:
+            return "not measured"
+        return "holds" if self.chance.low > 0.5 else "reversed" if self.chance.high < 0.5 else "undecided"
+
+
+def judge(claim: Claim, measurements: Measurements) -> tuple[str, list[Verdict]]:
+    """Whether a claim holds: all of its comparisons do; it does not as soon as one is the other way round."""
+    verdicts = [_compare(better, worse, measurements) for better, worse in claim.comparisons]
+    words = {verdict.word for verdict in verdicts}
+    for word, verdict in (("reversed", "does not hold"), ("not measured", "not measured"), ("undecided", "undecided")):
+        if word in words:
+            return verdict, verdicts
+    return "holds", verdicts
+
+
+def _compare(better: Side, worse: Side, measurements: Measurements) -> Verdict:
+    first, second = better.values(measurements), worse.values(measurements)
+    if first is None or second is None:
+        return Verdict(better, worse, None, None)
+    rng, paired = np.random.default_rng(0), better.world == worse.world
+    chance = probability_of_improvement(first, second, rng=rng, paired=paired, resamples=1000)
+    return Verdict(better, worse, chance, (float(first.mean()), float(second.mean())))
+
+
+def claim_tables(measurements: Measurements) -> dict[str, Table]:
+    """What holds of the claims, and every comparison."""
+    rows: list[list[str | float]] = []
+    details: list[list[str | float]] = []
+    for number, claim in enumerate(CLAIMS, start=1):
+        word, verdicts = judge(claim, measurements)
+        held, reversed_ = (sum(verdict.word == kind for verdict in verdicts) for kind in ("holds", "reversed"))
+        known = [verdict.chance for verdict in verdicts if verdict.chance is not None]
+        weakest = shown(min(known, key=lambda chance: chance.value), 2) if known else "-"
+        rows.append([f"{number}. {claim.text}", word, f"{held} of {len(verdicts)}", reversed_, weakest])
+        for verdict in verdicts:
+            means = [f"{mean:.3f}" for mean in verdict.means] if verdict.means else ["-", "-"]
+            chance = "-" if verdict.chance is None else shown(verdict.chance, 2)
+            details.append([str(number), f"{verdict.better} < {verdict.worse}", *means, chance, verdict.word])
+    caption = (
+        "A comparison holds where the 95 % interval of the probability of improvement lies above one half, and is "
+        "reversed where it lies below. A claim holds where all its comparisons do, and does not where one is reversed; "
+        "else it is undecided at this size. Weakest: the lowest probability of improvement among them."
+    )
+    if measurements.config.seeds == 1:
+        caption += " With one training of each model this tells of these trainings, not of the architectures."
+    about = (
+        "Probability that the first has the lower figure on a flight, over all pairs of seeds (Agarwal et al. 2021), "
+        "with its 95 % bootstrap interval over seeds and flights, and both means."
+    )
+    header = ["the paper says", "here", "comparisons that hold", "reversed", "weakest [95 %]"]
+    every = ["claim", "comparison", "first", "second", "probability [95 %]", "here"]
+    return {
+        "claims": Table("What holds of the paper's orderings", header, rows, caption),
+        "comparisons": Table("Every comparison", every, details, about),
+    }

@@ -1,0 +1,151 @@
+"""What is measured of a study's models: their errors on the expert's flights, and flights of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+
+from modgnn_rl.cells import Outcome, Result
+from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig
+from modgnn_rl.dataset import FlightDataset
+from modgnn_rl.evaluation import Flights, fly, reference_policies
+from modgnn_rl.experts import LocalReynolds
+from modgnn_rl.loading import load_policy
+from modgnn_rl.metrics import action_error
+from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.progress import Progress
+from modgnn_rl.seeds import derive_seed
+from modgnn_rl.studies import Study, Subject, World
+from modgnn_rl.trainers.imitation import imitation_loss
+
+__all__ = ["VALIDATION", "Measurements", "flight_cell", "fly_references", "fly_subject", "look_on", "validate"]
+
+VALIDATION = "validation"  # the world of the expert's held-out flights
+STATES = 50  # of each held-out flight that the validation error is taken on
+# Figures of a flight, one a flock; the spread is that over time and agents.
+FIGURES = ("error", "leader_distance", "cohesion", "separation", "reward", "smallest_distance", "lost", "diverged")
+
+
+def flight_cell(config: ReproduceConfig, subject: Subject, seed: int, study: Study, world: str) -> str:
+    """The name of the cell in which a subject flies in a world."""
+    return f"{study.family}-{config.after}-{subject.key}-seed{seed}-{world}"
+
+
+def _policy(config: ReproduceConfig, folder: Path, subject: Subject, done: Mapping[str, Result]) -> ModGNN:
+    made = next(result for result in done.values() if "policies" in result)
+    return load_policy(folder / made["policies"][subject.key], device=config.device)
+
+
+def fly_subject(
+    config: ReproduceConfig, folder: Path, subject: Subject, world: World, done: Mapping[str, Result]
+) -> Result:
+    """Fly a subject's policy in a world; its figures by name, one a flock."""
+    policy = _policy(config, folder, subject, done)
+    with Progress(f"{subject.key} flies in {world.name}", world.flocks * world.steps) as progress:
+        return _fly_in(policy, config, world, progress)
+
+
+def fly_references(config: ReproduceConfig, world: World, done: Mapping[str, Result]) -> Result:
+    """Fly the expert, the local experts and doing nothing in a world; their figures by name of the row."""
+    policies = reference_policies(_changed(config, world))
+    with Progress(f"references fly in {world.name}", len(policies) * world.flocks * world.steps) as progress:
+        return {name: _fly_in(policy, config, world, progress) for name, policy in policies.items()}
+
+
+def _changed(config: ReproduceConfig, world: World) -> FlockingConfig:
+    return dataclasses.replace(config.env, num_agents=world.num_agents, **world.changes)
+
+
+def _fly_in(policy: TensorDictModuleBase, config: ReproduceConfig, world: World, progress: Progress) -> Result:
+    """The figures of flights from the same starts for all policies and seeds."""
+    flights = fly(
+        policy,
+        _changed(config, world),
+        num_agents=world.num_agents,
+        num_flocks=world.flocks,
+        steps=world.steps,
+        seed=derive_seed(config.seed, "flights"),
+        device=config.device,
+        progress=progress,
+    )
+    return _figures(flights)
+
+
+def _figures(flights: Flights) -> Result:
+    figures = {name: getattr(flights, name).double() for name in FIGURES}
+    for name, squares in flights.squares.items():
+        figures[f"{name}_square"] = squares
+        figures[f"{name}_spread"] = (squares - figures[name].square()).clamp(min=0).sqrt()
+    return {name: values.tolist() for name, values in figures.items()}
+
+
+def _held_out(config: ReproduceConfig, folder: Path, length: int) -> Iterator[TensorDict]:
+    """Windows [T, W] of each of the expert's held-out flights, evenly over the flight."""
+    dataset = FlightDataset.open(folder / "dataset", verify=False, device=config.device)
+    for episode in range(dataset.episodes - config.scale.held_out, dataset.episodes):
+        steps = torch.linspace(0, dataset.steps - 1, min(STATES, dataset.steps)).round().long()
+        yield dataset.windows(episode * dataset.steps + steps, length)
+
+
+@torch.no_grad()
+def validate(config: ReproduceConfig, folder: Path, subject: Subject, done: Mapping[str, Result]) -> Result:
+    """The error of a policy that looks on while the expert flies, one a flight."""
+    policy = _policy(config, folder, subject, done)
+    errors = []
+    for windows in _held_out(config, folder, policy.window):
+        errors.append(float(imitation_loss(policy, windows, windows["agents", "controlled"][:, -1])))
+    return {"error": errors}
+
+
+@torch.no_grad()
+def look_on(config: ReproduceConfig, folder: Path, done: Mapping[str, Result]) -> Result:
+    """The error of each reference that looks on while the expert flies, one a flight."""
+    policies = reference_policies(config.env)
+    errors: dict[str, list[float]] = {name: [] for name in policies}
+    for windows in _held_out(config, folder, 2):
+        now = windows[:, -1]
+        for name, policy in policies.items():
+            seen = now.copy()
+            if isinstance(policy, LocalReynolds):
+                seen[policy.cache] = windows["agents", "observation"][:, 0]
+            agents = policy(seen)["agents"]
+            error = action_error(agents["action"], now["agents", "expert_action"], now["agents", "controlled"])
+            errors[name].append(float(error.mean()))
+    return {name: {"error": values} for name, values in errors.items()}
+
+
+class Measurements:
+    """What was measured, by row of a table and world.
+
+    Args:
+        outcome: of the cells of a study.
+        config: its settings.
+        study: the study.
+    """
+
+    def __init__(self, outcome: Outcome, config: ReproduceConfig, study: Study) -> None:
+        self.outcome, self.config, self.study = outcome, config, study
+
+    def values(self, row: Subject | str, world: str, figure: str) -> NDArray[np.float64] | None:
+        """A figure of all flights [S, F] of each seed that did not fail; None where all did.
+
+        Args:
+            row: a subject, or the name of a reference.
+            world: name of the world.
+            figure: its name. What is no number counts as infinite: a flight that ended nowhere.
+        """
+        results = self.outcome.results
+        if isinstance(row, str):
+            found = [results.get(f"references-{world}", {}).get(row)]
+        else:
+            seeds = range(self.config.seeds)
+            found = [results.get(flight_cell(self.config, row, seed, self.study, world)) for seed in seeds]
+        rows = [entry[figure] for entry in found if entry]
+        return np.nan_to_num(np.array(rows, dtype=float), nan=np.inf, posinf=np.inf) if rows else None

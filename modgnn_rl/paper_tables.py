@@ -1,0 +1,200 @@
+"""The paper's three tables with what was measured here beside the paper's figures."""
+
+from __future__ import annotations
+
+import functools
+import importlib.resources
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import yaml
+
+from modgnn_rl.measuring import VALIDATION, Measurements
+from modgnn_rl.statistics import Interval, interquartile_interval
+from modgnn_rl.studies import Subject
+from modgnn_rl.tabular import Table
+
+__all__ = ["REFERENCES", "middle", "paper_tables", "published", "shown", "title_of"]
+
+NAMES = {
+    "modgnn_mlp": "ModGNN-MLP",
+    "no_mid": "ModGNN-MLP [-f_mid]",
+    "no_pre": "ModGNN-MLP [-f_pre]",
+    "gcn": "GCN",
+    "gcn_final": "GCN [+f_final]",
+    "central": "Central",
+    "modgnn_adjacency": "ModGNN-MLP, adjacency",
+    "gat": "attention",
+    "mpnn": "message passing",
+}
+REFERENCES = ("expert", "LocalReynolds(hops=2)", "LocalReynolds(hops=1)", "zero action")
+METRES = {"leader_distance": "leader distance", "cohesion": "cohesion", "separation": "separation"}
+Row = Subject | str
+
+
+@functools.cache
+def published() -> dict[str, Any]:
+    """The paper's figures: ``validation_loss``, ``model_evaluation`` and ``generalization`` by model and hops."""
+    text = importlib.resources.files("modgnn_rl").joinpath("paper_tables.yaml").read_text(encoding="utf-8")
+    return dict(yaml.safe_load(text))
+
+
+def title_of(row: Row) -> str:
+    """What a row is called in tables."""
+    if isinstance(row, str):
+        return row
+    if row.model == "central":
+        return NAMES[row.model]
+    layers = "" if row.layers is None else f", L = {row.layers}"
+    return f"{NAMES[row.model]}{layers}, K = {row.hops}"
+
+
+def middle(measurements: Measurements, row: Row, world: str, figure: str) -> Interval | None:
+    """Interquartile mean of a figure over seeds and flights, with its 95 % interval; None where all failed."""
+    values = measurements.values(row, world, figure)
+    return None if values is None else interquartile_interval(values, rng=np.random.default_rng(0))
+
+
+def shown(interval: Interval | None, digits: int = 3) -> str:
+    """An interquartile mean with its interval as text."""
+    if interval is None:
+        return "failed"
+    value, low, high = (f"{number:.{digits}f}" for number in (interval.value, interval.low, interval.high))
+    return f"{value} [{low}, {high}]"
+
+
+def paper_tables(measurements: Measurements) -> dict[str, Table]:
+    """The tables by the name of their files."""
+    rows: list[Row] = [*REFERENCES, *measurements.study.subjects]
+    return {
+        "table1": _validation(measurements, rows),
+        "table2": _evaluation(measurements, rows),
+        "table2_middle": _evaluation_middle(measurements, rows),
+        "table3": _generalization(measurements, rows),
+    }
+
+
+def _mean(measurements: Measurements, row: Row, world: str, figure: str) -> float:
+    values = measurements.values(row, world, figure)
+    return math.nan if values is None else float(values.mean())
+
+
+def _about(measurements: Measurements, world: str) -> str:
+    """How many flights a table rests on."""
+    seeds = measurements.config.seeds
+    counted = (
+        f"{seeds} trainings of each model" if seeds > 1 else "one training of each model, so intervals tell of flights"
+    )
+    if world == VALIDATION:
+        return f"{measurements.config.scale.held_out} flights of the expert that no model was trained on; {counted}."
+    flown = next(entry for entry in measurements.study.worlds if entry.name == world)
+    return f"{flown.flocks} flights of {flown.steps} steps, from the same starts for all rows; {counted}."
+
+
+def _paper(row: Row, *keys: Any) -> Any:
+    """A figure of the paper, or None."""
+    entry: Any = published()
+    for key in keys:
+        entry = entry.get(key) if isinstance(entry, dict) else None
+    return entry
+
+
+def _hops(row: Row) -> tuple[str, Any]:
+    """Model and hops under which the paper lists a row."""
+    return (row, "inf") if isinstance(row, str) else (row.model, row.hops)
+
+
+def _validation(measurements: Measurements, rows: Sequence[Row]) -> Table:
+    body = []
+    for row in rows:
+        model, hops = _hops(row)
+        paper = _paper(row, "validation_loss", model, hops)
+        here = middle(measurements, row, VALIDATION, "error")
+        mean = _mean(measurements, row, VALIDATION, "error")
+        body.append([title_of(row), math.nan if paper is None else paper, mean, shown(here)])
+    caption = (
+        "Mean squared error against the expert's action, per component, m²/s², while the expert flies. Middle: "
+        f"interquartile mean with its 95 % interval over seeds and flights. {_about(measurements, VALIDATION)}"
+    )
+    header = ["model", "paper", "mean", "middle [95 %]"]
+    return Table("Table 1: validation error", header, body, caption, {1: "low", 2: "low"}, REFERENCES)
+
+
+def _evaluation(measurements: Measurements, rows: Sequence[Row]) -> Table:
+    header = ["model", "error, paper", "error"]
+    for name in METRES.values():
+        header += [f"{name}, paper", name]
+    body = []
+    for row in rows:
+        model, hops = _hops(row)
+        paper = _paper(row, "model_evaluation", model, hops) or {}
+        cells: list[Any] = [title_of(row), paper.get("error", math.nan), _mean(measurements, row, "N32", "error")]
+        for figure in METRES:
+            there = paper.get(figure)
+            cells += ["-" if there is None else f"{there[0]:.2f} ± {there[1]:.2f}", _spread(measurements, row, figure)]
+        body.append([*cells, _share(measurements, row, "lost")])
+    caption = (
+        "Flights of the models' own with 32 agents. Error: mean squared, against the expert's action, m²/s². Leader "
+        "distance, cohesion and separation: mean ± standard deviation over time, agents and flights, m. Lost: share of "
+        f"flocks in which nobody hears the leader at the end. {_about(measurements, 'N32')}"
+    )
+    best: dict[int, Any] = {1: "low", 2: "low", 3: "low", 4: "low", 5: "low", 6: "low"}
+    return Table("Table 2: flights of the models' own", [*header, "lost"], body, caption, best, REFERENCES)
+
+
+def _spread(measurements: Measurements, row: Row, figure: str) -> str:
+    """Mean ± standard deviation over time, agents, flights and seeds."""
+    values, squares = (measurements.values(row, "N32", name) for name in (figure, f"{figure}_square"))
+    if values is None or squares is None:
+        return "failed"
+    return f"{values.mean():.2f} ± {math.sqrt(max(0.0, squares.mean() - values.mean() ** 2)):.2f}"
+
+
+def _share(measurements: Measurements, row: Row, figure: str) -> str:
+    values = measurements.values(row, "N32", figure)
+    return "failed" if values is None else f"{values.mean():.0%}"
+
+
+def _evaluation_middle(measurements: Measurements, rows: Sequence[Row]) -> Table:
+    figures = {"error": "error", **METRES, "separation_spread": "spread of separation", "reward": "reward"}
+    body = [
+        [
+            title_of(row),
+            *(shown(middle(measurements, row, "N32", name), 3 if name == "error" else 2) for name in figures),
+        ]
+        for row in rows
+    ]
+    caption = (
+        "The same flights: interquartile means over seeds and flights with their 95 % intervals. Spread of separation: "
+        "its standard deviation over the time and agents of a flight, m. Reward: of an agent, summed over the flight."
+    )
+    best: dict[int, Any] = {1: "low", 2: "low", 3: "low", 5: "low", 6: "high"}
+    return Table("Table 2, middle of the flights", ["model", *figures.values()], body, caption, best, REFERENCES)
+
+
+def _generalization(measurements: Measurements, rows: Sequence[Row]) -> Table:
+    worlds = [world for world in measurements.study.worlds if not world.changes]
+    header, body = ["model"], []
+    for world in worlds:
+        header += [f"N = {world.num_agents}, paper", f"N = {world.num_agents}", "middle [95 %]"]
+    for row in rows:
+        model, hops = _hops(row)
+        if model == "central":
+            continue
+        cells: list[Any] = [title_of(row)]
+        for world in worlds:
+            paper = _paper(row, "generalization", model, hops, world.num_agents)
+            mean = _mean(measurements, row, world.name, "error")
+            here = middle(measurements, row, world.name, "error")
+            cells += [math.nan if paper is None else paper, mean, shown(here)]
+        body.append(cells)
+    caption = (
+        "Error on flights of the models' own with other numbers of agents than the 32 of training: mean, and "
+        f"interquartile mean with its 95 % interval. {_about(measurements, worlds[0].name)}"
+    )
+    best: dict[int, Any] = {
+        column: "low" for start in range(1, 1 + 3 * len(worlds), 3) for column in (start, start + 1)
+    }
+    return Table("Table 3: other numbers of agents", header, body, caption, best, REFERENCES)

@@ -1,0 +1,256 @@
+"""The page of a study: the tables and figures that answer what is asked."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from modgnn_rl.claims import claim_tables
+from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig
+from modgnn_rl.files import write_atomically
+from modgnn_rl.measuring import VALIDATION, Measurements
+from modgnn_rl.paper_tables import NAMES, REFERENCES, middle, paper_tables, shown, title_of
+from modgnn_rl.plots import Curve, Estimate, draw_curves, draw_intervals
+from modgnn_rl.report import Details, Figure, Section, gather_provenance, write_report
+from modgnn_rl.studies import FAULTS, HOPS, Subject, World, fault_name
+from modgnn_rl.tabular import Table, as_csv, as_latex, as_markdown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+__all__ = ["QUESTIONS", "write_study"]
+
+QUESTIONS = {
+    "tables": "The paper's tables",
+    "communication": "Which kind of communication f_com serves best?",
+    "layers": "What do layers and hops bring at equal numbers of parameters?",
+    "range": "Which model is most robust to another communication range than the 3.5 m of training?",
+    "faults": "Which model is most robust to lost and late messages, noise and drop-outs?",
+    "size": "How does one set of weights, trained with 32 agents, fly flocks of other sizes?",
+}
+STAGES = {
+    "cloning": "cloning of the expert's flights, as in the paper",
+    "dagger": "cloning, then DAgger",
+    "mappo": "cloning, DAgger, then MAPPO",
+}
+
+
+def write_study(measurements: Measurements, folder: Path, started: datetime | None = None) -> Path:
+    """Write the tables of a study, each as CSV and LaTeX and all on one page, and the report.
+
+    Args:
+        measurements: what was measured.
+        folder: of the reproduction; the study has a folder of its own in it.
+        started: when this command began, with a time zone.
+
+    Returns:
+        the path of ``report.html``; ``tables.md`` is beside it.
+    """
+    config, outcome = measurements.config, measurements.outcome
+    place = folder / (config.study if config.after == "cloning" else f"{config.study}-after-{config.after}")
+    place.mkdir(parents=True, exist_ok=True)
+    tables, figures, text = _tabled(measurements) if config.study == "tables" else _studied(measurements)
+    failed = "\n\n".join(f"Failed: {line}." for line in outcome.failure_lines())
+    title = f"{QUESTIONS[config.study]} ({config.scale.name}, {config.seeds} seed{'s' if config.seeds > 1 else ''})"
+    about = f"Policies made by {STAGES[config.after]}. {text}"
+    if config.scale.name == "smoke":
+        about += " At this scale hardly anything is learned: it shows that everything runs."
+    for name, table in tables.items():
+        write_atomically(place / f"{name}.csv", as_csv(table))
+        write_atomically(place / f"{name}.tex", as_latex(table))
+    page = [f"# {title}", about, failed, *(as_markdown(table) for table in tables.values())]
+    write_atomically(place / "tables.md", "\n\n".join(filter(None, page)))
+    times = "\n".join(f"{seconds:8.1f} s  {name}" for name, seconds in outcome.seconds.items())
+    sections = [
+        *([Section("What failed", failed)] if failed else []),
+        Section("Results", about, [*figures, *tables.values()]),
+        Section("Settings", "", [Details("all settings", _yaml(config)), Details("time of each cell", times)]),
+    ]
+    spent = {"all cells": f"{sum(outcome.seconds.values()) / 60:.1f} min on one process"}
+    return write_report(place, title, sections, gather_provenance(started=started, times=spent))
+
+
+def _yaml(config: ReproduceConfig) -> str:
+    return OmegaConf.to_yaml(OmegaConf.structured(config))
+
+
+def _tabled(measurements: Measurements) -> tuple[dict[str, Table], list[Figure], str]:
+    """The paper's tables and claims."""
+    tables = {**claim_tables(measurements), **paper_tables(measurements)}
+    order = ("claims", "table1", "table2", "table2_middle", "table3", "comparisons")
+    figures = [
+        Figure("validation_error", _by_hops(measurements, VALIDATION), "Error on the expert's flights, m²/s²."),
+        Figure("error_in_flight", _by_hops(measurements, "N32"), "Error on flights of the models' own, m²/s²."),
+    ]
+    return {name: tables[name] for name in order}, figures, "The figures of the paper stand beside those found here."
+
+
+def _estimate(measurements: Measurements, row: Subject | str, world: str) -> Estimate | None:
+    found = middle(measurements, row, world, "error")
+    return None if found is None or not np.isfinite(found.high) else Estimate(found.value, found.low, found.high)
+
+
+def _by_hops(measurements: Measurements, world: str) -> Callable[[Canvas], None]:
+    """Draws a row for each model, a marker for each number of hops (and layers), the references as lines."""
+    groups: dict[str, dict[str, Estimate]] = {}
+    for subject in measurements.study.subjects:
+        layers = "" if subject.layers is None else f"L = {subject.layers}, "
+        if (estimate := _estimate(measurements, subject, world)) is not None:
+            groups.setdefault(f"{layers}K = {subject.hops}", {})[NAMES[subject.model]] = estimate
+    lines = {name: _estimate(measurements, name, world) for name in REFERENCES[2:]}
+    references = {name: line.value for name, line in lines.items() if line is not None}
+    return functools.partial(_draw_intervals, groups=groups, references=references)
+
+
+def _draw_intervals(canvas: Canvas, groups: dict[str, dict[str, Estimate]], references: dict[str, float]) -> None:
+    draw_intervals(canvas, groups, x_label="error, m²/s²", references=references, log_x=True)
+
+
+def _studied(measurements: Measurements) -> tuple[dict[str, Table], list[Figure], str]:
+    """A table of errors and one of lost flocks, a row for each model and a column for each world; a figure."""
+    config, study = measurements.config, measurements.study
+    name = config.study
+    if name in ("communication", "layers"):
+        figures = [Figure(name, _by_hops(measurements, "study-32"), "Error on flights of the models' own, m²/s².")]
+        worlds = {"expert's flights": VALIDATION, "own flights": "study-32"}
+    else:
+        figures = (_curves_by_fault if name == "faults" else _curves_by_hops)(measurements)
+        worlds = {_heading(world): world.name for world in study.worlds}
+    usual = next(world.name for world in study.worlds if _is_usual(config, world))
+    tables = {"errors": _errors(measurements, "Errors", worlds, usual)}
+    if name == "faults":
+        tables = {f"errors_{fault}": table for fault, table in _errors_by_fault(measurements, usual)}
+    return {**tables, "lost": _lost(measurements, worlds)}, figures, _answer(measurements, worlds, usual)
+
+
+def _errors_by_fault(measurements: Measurements, usual: str) -> Iterator[tuple[str, Table]]:
+    """A table for each fault, by its setting."""
+    for kind, levels in FAULTS.items():
+        worlds = {"as trained": usual, **{f"{level:g}": fault_name(change) for level, change in levels}}
+        yield next(iter(levels[0][1])), _errors(measurements, f"Errors by {kind}", worlds, usual)
+
+
+def _is_usual(config: ReproduceConfig, world: World) -> bool:
+    same = all(getattr(config.env, name) == value for name, value in world.changes.items())
+    return same and (world.num_agents == REFERENCE_SIZE or config.study != "size")
+
+
+def _heading(world: World) -> str:
+    if world.name.startswith("size-"):
+        return f"N = {world.num_agents}"
+    return ", ".join(f"{name} {value}" for name, value in world.changes.items()) or "as trained"
+
+
+def _rows(measurements: Measurements) -> list[Subject | str]:
+    return [*REFERENCES, *measurements.study.subjects]
+
+
+def _errors(measurements: Measurements, title: str, worlds: Mapping[str, str], usual: str) -> Table:
+    rises = len(worlds) > 2
+    body: list[list[str | float]] = []
+    for row in _rows(measurements):
+        cells: list[str | float] = [shown(middle(measurements, row, world, "error")) for world in worlds.values()]
+        cells += [_rise(measurements, row, worlds, usual)] if rises else []
+        body.append([title_of(row), *cells])
+    caption = (
+        "Error against the expert's action, m²/s²: interquartile mean over seeds and flights with its 95 % interval."
+    )
+    if rises:
+        caption += " Rise: mean over the other worlds, minus the error in the world of training."
+    best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(worlds) + rises), "low")
+    header = ["model", *worlds, *(["rise"] if rises else [])]
+    return Table(title, header, body, f"{caption} {_flown(measurements)}", best, REFERENCES)
+
+
+def _rise(measurements: Measurements, row: Subject | str, worlds: Mapping[str, str], usual: str) -> float:
+    found = {world: middle(measurements, row, world, "error") for world in {*worlds.values(), usual}}
+    values = {world: np.nan if interval is None else interval.value for world, interval in found.items()}
+    return float(np.mean([value for world, value in values.items() if world != usual]) - values[usual])
+
+
+def _flown(measurements: Measurements) -> str:
+    flown = {(world.flocks, world.steps) for world in measurements.study.worlds}
+    flights = sorted({flocks for flocks, _ in flown})
+    span = f"{flights[0]}" if len(flights) == 1 else f"{flights[0]} to {flights[-1]}"
+    return f"{span} flights of {measurements.study.worlds[0].steps} steps from the same starts for all rows."
+
+
+def _lost(measurements: Measurements, worlds: Mapping[str, str]) -> Table:
+    flown = {heading: world for heading, world in worlds.items() if world != VALIDATION}
+    body = []
+    for row in _rows(measurements):
+        shares = [measurements.values(row, world, "lost") for world in flown.values()]
+        body.append([title_of(row), *("failed" if share is None else f"{share.mean():.0%}" for share in shares)])
+    best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(flown)), "low")
+    return Table("Share of flocks that lost their leader", ["model", *flown], body, "At the end.", best, REFERENCES)
+
+
+def _answer(measurements: Measurements, worlds: Mapping[str, str], usual: str) -> str:
+    """The best rows in words."""
+    subjects = measurements.study.subjects
+    errors = {title_of(row): middle(measurements, row, usual, "error") for row in subjects}
+    known = {title: interval.value for title, interval in errors.items() if interval is not None}
+    if not known:
+        return "Nothing could be measured."
+    text = f"Lowest error in the world of training: {min(known, key=known.__getitem__)}."
+    rises = {title_of(row): _rise(measurements, row, worlds, usual) for row in subjects}
+    others = {title: known[title] + rise for title, rise in rises.items() if title in known and np.isfinite(rise)}
+    if len(worlds) > 2 and others:
+        text += f" Lowest mean error in the others: {min(others, key=others.__getitem__)}."
+        idle = middle(measurements, "zero action", usual, "error")
+        able = {title: rises[title] for title in others if idle is not None and known[title] < idle.value}
+        text += f" Least rise, of those better than doing nothing: {min(able, key=able.__getitem__)}." if able else ""
+    return f"{text} ModGNN-MLP's f_com is the Laplacian." if measurements.config.study == "communication" else text
+
+
+def _curves_by_hops(measurements: Measurements) -> list[Figure]:
+    """A figure for each K: errors over the communication range, or over the number of agents."""
+    study, is_size = measurements.study, measurements.config.study == "size"
+    label = "agents" if is_size else "communication range, m"
+    at = [(world.num_agents if is_size else world.changes["comm_range"], world.name) for world in study.worlds]
+    marks = {"trained": float(REFERENCE_SIZE) if is_size else measurements.config.env.comm_range}
+    return [
+        Figure(
+            f"{measurements.config.study}_K{hops}",
+            functools.partial(
+                draw_curves,
+                curves=_curves(measurements, hops, at),
+                x_label=label,
+                y_label="error, m²/s²",
+                marks=marks,
+                log_x=is_size,
+            ),
+            f"Error on flights of the models' own over {label}, K = {hops}; bands are 95 % intervals.",
+        )
+        for hops in HOPS
+    ]
+
+
+def _curves_by_fault(measurements: Measurements) -> list[Figure]:
+    """A figure for each fault: errors of the models with K = 1 over its strength."""
+    figures = []
+    for kind, levels in FAULTS.items():
+        at = [(0.0, "study-32"), *((level, fault_name(change)) for level, change in levels)]
+        draw = functools.partial(draw_curves, curves=_curves(measurements, 1, at), x_label=kind, y_label="error, m²/s²")
+        caption = f"Error on flights of the models' own over {kind}, K = 1; bands are 95 % intervals."
+        figures.append(Figure(f"faults_{next(iter(levels[0][1]))}", draw, caption))
+    return figures
+
+
+def _curves(measurements: Measurements, hops: int, at: Sequence[tuple[float, str]]) -> dict[str, Curve]:
+    """A curve for each model and two references, over levels with the names of their worlds."""
+    models = list(dict.fromkeys(subject.model for subject in measurements.study.subjects))
+    rows: dict[str, Subject | str] = {NAMES[model]: Subject(model, hops) for model in models}
+    rows |= {"LocalReynolds": "LocalReynolds(hops=1)", "zero action": "zero action"}
+    curves, unknown = {}, Estimate(np.nan, np.nan, np.nan)
+    for name, row in rows.items():
+        found = [_estimate(measurements, row, world) or unknown for _, world in at]
+        value, low, high = ([getattr(one, end) for one in found] for end in ("value", "low", "high"))
+        curves[name] = Curve([level for level, _ in at], value, low, high)
+    return curves

@@ -1,0 +1,221 @@
+"""The reproduction: its trainings, its measurements, its claims, its folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from modgnn_rl.cells import Outcome, run_cells
+from modgnn_rl.claims import CLAIMS, Claim, Side, judge
+from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig, ScaleConfig
+from modgnn_rl.errors import InputError
+from modgnn_rl.loading import load_policy
+from modgnn_rl.measuring import VALIDATION, Measurements
+from modgnn_rl.paper_tables import published
+from modgnn_rl.reproduce import claim_folder
+from modgnn_rl.reproducing import cells_of
+from modgnn_rl.studies import Study, Subject, World, equal_hidden, study_of
+from modgnn_rl.study_pages import write_study
+
+TINY = ScaleConfig(
+    name="tiny", episodes=4, steps=30, held_out=2, updates=6, batch_size=4, flocks=2, flight_steps=8, sizes=[32],
+    rounds=1, iterations=1, num_envs=2, study_updates=4, study_flocks=2, study_steps=8, study_sizes=[4, 32],
+)  # fmt: skip
+WORLD = World("N32", 32, 2, 8)
+
+
+@pytest.fixture(scope="module")
+def reproduction(tmp_path_factory):
+    """Two GCNs trained side by side, and Central, all measured."""
+    folder = tmp_path_factory.mktemp("reproduction")
+    config = ReproduceConfig(scale=TINY)
+    study = Study("tables", [Subject("gcn", 1), Subject("gcn", 2), Subject("central", 1)], [WORLD], TINY.updates)
+    outcome = run_cells(folder / "cells", cells_of(config, study, folder))
+    assert not outcome.failures
+    return folder, config, study, outcome
+
+
+def test_models_trained_apart_see_the_same_batches_as_side_by_side(reproduction, tmp_path):
+    """Else the rows of the tables, which are trained in groups, would not be comparable."""
+    folder, config, _, outcome = reproduction
+    alone = Study("alone", [Subject("gcn", 2)], [], TINY.updates)
+    (tmp_path / "dataset").symlink_to(folder / "dataset")
+    cells = [cell for cell in cells_of(config, alone, tmp_path) if "validation" not in cell.name]
+    apart = run_cells(tmp_path / "cells", cells)
+    (mine,) = (tmp_path / result["policies"]["gcn-K2"] for result in apart.results.values() if "policies" in result)
+    beside = folder / outcome.results["tables-cloning-gcn-K12-seed0"]["policies"]["gcn-K2"]
+    for name, weights in load_policy(mine).state_dict().items():
+        torch.testing.assert_close(weights, load_policy(beside).state_dict()[name])
+
+
+def test_started_again_it_makes_what_is_missing_and_nothing_else(reproduction):
+    folder, config, study, outcome = reproduction
+    times = {file: file.stat().st_mtime_ns for file in (folder / "cells").glob("*.json")}
+    missing = folder / "cells" / "tables-cloning-gcn-K2-seed0-N32.json"
+    missing.unlink()
+    again = run_cells(folder / "cells", cells_of(config, study, folder))
+    assert again.results == outcome.results
+    changed = {file for file, time in times.items() if file.stat().st_mtime_ns != time}
+    assert changed == {missing}
+
+
+def test_the_references_have_the_errors_that_they_must_have(reproduction):
+    _, config, study, outcome = reproduction
+    measured = Measurements(outcome, config, study)
+    for world in (VALIDATION, "N32"):
+        expert, local, idle = (
+            measured.values(name, world, "error") for name in ("expert", "LocalReynolds(hops=1)", "zero action")
+        )
+        assert expert.max() == 0
+        assert (idle <= config.env.max_speed**2 / 3 + 1e-6).all()
+        assert (local < idle).all()
+        assert expert.shape == local.shape == (1, 2)
+
+
+@torch.no_grad()
+def test_validation_is_the_error_of_a_policy_that_looks_on(reproduction):
+    """An independent way to the same number: step by step, the policy's action written beside the expert's."""
+    from tensordict import TensorDict
+
+    from modgnn_rl.dataset import FlightDataset
+
+    folder, config, study, outcome = reproduction
+    policy = load_policy(folder / outcome.results["tables-cloning-gcn-K12-seed0"]["policies"]["gcn-K2"])
+    dataset = FlightDataset.open(folder / "dataset")
+    state = None
+    errors = []
+    for step in range(dataset.steps):
+        now = dataset.windows(torch.tensor([4 * dataset.steps + step]), 1)[:, 0]  # the first held-out flight
+        messages = {} if state is None else dict(state["next"].items())
+        seen = policy(TensorDict({**now.to_dict(), **messages}, now.batch_size))
+        difference = seen["agents", "action"] - now["agents", "expert_action"]
+        errors.append(float(difference[0, 1:].square().mean()))
+        state = seen
+    found = Measurements(outcome, config, study).values(Subject("gcn", 2), VALIDATION, "error")
+    assert found[0, 0] == pytest.approx(np.mean(errors), rel=1e-4)  # all 30 states are fewer than the 50 taken
+
+
+def test_page_tables_and_report_are_written(reproduction):
+    folder, config, study, outcome = reproduction
+    page = write_study(Measurements(outcome, config, study), folder)
+    text = page.with_name("tables.md").read_text()
+    assert page.name == "report.html"
+    for name in ("Table 1", "Table 2", "Table 3", "What holds", "zero action", "Central", "0.267"):
+        assert name in text
+    assert {"table1.csv", "table1.tex", "table3.csv", "claims.tex"} <= {file.name for file in page.parent.iterdir()}
+
+
+def test_failed_cells_are_said_in_the_tables(reproduction, tmp_path):
+    _, config, study, outcome = reproduction
+    lost = {name: result for name, result in outcome.results.items() if "gcn-K1-" not in name}
+    broken = Outcome(lost, outcome.seconds, {"tables-cloning-gcn-K1-seed0-N32": "no luck"})
+    page = write_study(Measurements(broken, config, study), tmp_path).with_name("tables.md").read_text()
+    assert "Failed: tables-cloning-gcn-K1-seed0-N32: no luck." in page
+    row = next(line for line in page.splitlines() if line.startswith("| GCN, K = 1") and "0.363" in line)
+    assert "failed" in row
+
+
+@pytest.mark.parametrize(
+    "study", ["tables", *(pytest.param(study, marks=pytest.mark.slow) for study in ("range", "faults"))]
+)
+def test_where_all_failed_the_page_says_so(tmp_path, study):
+    config = ReproduceConfig(scale=TINY, study=study)
+    measured = Measurements(Outcome({}, {}, {"dataset": "the disk is full"}), config, study_of(config))
+    page = write_study(measured, tmp_path).with_name("tables.md").read_text()
+    assert "Failed: dataset: the disk is full." in page
+    assert "failed" in page
+
+
+def test_the_papers_figures_are_in_the_package():
+    tables = published()
+    assert tables["validation_loss"]["gcn"][3] == 0.657
+    assert tables["model_evaluation"]["expert"]["inf"]["leader_distance"] == [3.55, 3.96]
+    assert tables["generalization"]["no_mid"][1][16] == 0.237
+
+
+class Paper:
+    """Measurements that say what the paper's tables say: every flight of a row has the paper's mean."""
+
+    config = ReproduceConfig(seeds=3)
+
+    def values(self, row, world, figure):  # noqa: D102
+        if world == VALIDATION:
+            entry = published()["validation_loss"][row.model][row.hops]
+        elif world == "N32":
+            there = published()["model_evaluation"][row.model][row.hops]
+            name = {"separation_spread": "separation"}.get(figure, figure)
+            entry = there["error"] if figure == "error" else there[name][figure == "separation_spread"]
+        else:
+            entry = published()["generalization"][row.model][row.hops][int(world[1:])]
+        return np.full((3, 5), entry)
+
+
+def test_every_claim_holds_of_the_papers_own_figures():
+    assert {judge(claim, Paper())[0] for claim in CLAIMS} == {"holds"}
+
+
+def test_a_claim_is_reversed_undecided_or_not_measured():
+    flights = {"gcn": [[1.0, 2, 3, 4, 5, 6]], "no_mid": [[2.0, 3, 4, 5, 6, 7]], "no_pre": [[2.0, 1, 4, 3, 6, 5]]}
+
+    class Made:
+        def values(self, row, world, figure):
+            found = flights.get(row.model)
+            return None if found is None else np.array(found)
+
+    def word(*pairs):
+        claim = Claim("", tuple((Side(better, (1,)), Side(worse, (1,))) for better, worse in pairs))
+        return judge(claim, Made())[0]
+
+    assert word(("gcn", "no_mid")) == "holds"
+    assert word(("no_mid", "gcn")) == "does not hold"
+    assert word(("gcn", "no_pre")) == "undecided"
+    assert word(("gcn", "central")) == "not measured"
+    assert word(("gcn", "no_mid"), ("gcn", "no_pre")) == "undecided"
+    assert word(("gcn", "no_pre"), ("no_mid", "gcn"), ("gcn", "central")) == "does not hold"
+
+
+def test_studies_at_equal_parameters_have_equal_parameters():
+    from modgnn_rl.models import make_model
+
+    def size(subject):
+        model = make_model(subject.model, subject.hops, subject.hidden, layers=subject.layers, seed=0)
+        return sum(weights.numel() for weights in model.parameters())
+
+    sizes = [size(subject) for subject in study_of(ReproduceConfig(study="layers")).subjects]
+    assert max(sizes) < 1.06 * min(sizes)
+    assert equal_hidden("modgnn_mlp", 1, 1) == 32
+
+
+@pytest.mark.parametrize("study", ["tables", "communication", "layers", "range", "faults", "size"])
+def test_the_cells_of_every_study_have_names_of_their_own_and_all_that_they_need(study, tmp_path):
+    config = ReproduceConfig(study=study, after="mappo", seeds=2)
+    cells = cells_of(config, study_of(config), tmp_path)
+    names = [cell.name for cell in cells]
+    assert len(set(names)) == len(names)
+    assert {need for cell in cells for need in cell.needs} <= set(names)
+    assert all(math.isfinite(cell.cost) and cell.cost > 0 for cell in cells)
+
+
+def test_a_folder_keeps_to_its_settings(tmp_path):
+    folder = str(tmp_path / "one")
+    config = ReproduceConfig(folder=folder, env=FlockingConfig(leader_max_speed=math.inf))
+    assert claim_folder(config) == claim_folder(dataclasses.replace(config, seeds=5, study="range", after="dagger"))
+    changed = dataclasses.replace(config, scale=dataclasses.replace(config.scale, updates=7))
+    with pytest.raises(InputError, match=r"was begun with scale.updates=6000"):
+        claim_folder(changed)
+    (tmp_path / "one" / "settings.json").write_text("{")
+    with pytest.raises(InputError, match="damaged"):
+        claim_folder(config)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot write"):
+        claim_folder(dataclasses.replace(config, folder=str(tmp_path / "file" / "below")))
+
+
+def test_a_folder_beside_the_user_is_meant_from_there(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert claim_folder(ReproduceConfig()) == tmp_path / "reproduction" / "small"
+    assert claim_folder(ReproduceConfig(folder="mine")) == tmp_path / "mine"  # runs know themselves by absolute paths
