@@ -94,7 +94,7 @@ def _fly_all(
     flight: dict[str, Any],
 ) -> dict[str, Recording]:
     """Record everybody's flight; the first one is shown while it is flown, where that is asked for."""
-    recordings = {}
+    recordings: dict[str, Recording] = {}
     with (
         contextlib.ExitStack() as stack,
         Progress("replay", len(policies) * flight["steps"]) as progress,

@@ -48,7 +48,7 @@ class Browser:
                 os.dup2(write, 4)
 
             command = [CHROMIUM, *FLAGS, f"--user-data-dir={home}", "about:blank"]
-            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
             self._process = subprocess.Popen(command, preexec_fn=take, pass_fds=(3, 4), **quiet)
             stack.callback(self._process.wait)
             stack.callback(self._process.kill)
