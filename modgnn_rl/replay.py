@@ -33,8 +33,13 @@ def refuse(config: ReplayConfig) -> None:
     """
     for folder in (config.run, *as_list(config.others or [])):
         RunFolder.open(folder)
-    if config.output is not None and not Path(config.output).absolute().parent.is_dir():
-        raise InputError(f"output={config.output} lies in a folder that does not exist; make it first")
+    if config.output is not None:
+        if Path(config.output).suffix.lower() != f".{config.format}":
+            raise InputError(f"output={config.output} must be a file whose name ends in .{config.format}, as format= says")
+        if not Path(config.output).absolute().parent.is_dir():
+            raise InputError(f"output={config.output} lies in a folder that does not exist; make it first")
+    if config.step is not None and config.format not in ("svg", "png"):
+        raise InputError(f"step={config.step} is the step of a picture; give format=svg or format=png, or leave it out")
     if config.step is not None and config.step >= config.steps:
         raise InputError(f"step={config.step} is not flown: there are steps={config.steps}, counted from 0")
     if config.format == "mp4" and (config.others or config.viewer):

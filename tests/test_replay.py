@@ -145,6 +145,9 @@ def test_what_cannot_be_done_is_said_in_one_sentence(tmp_path):
     for config, words in (
         (ReplayConfig(run=str(tmp_path / "none")), "none"),
         (ReplayConfig(run=run, output=str(tmp_path / "no" / "a.html")), "folder that does not exist"),
+        (ReplayConfig(run=run, output=str(tmp_path)), r"a file whose name ends in \.html"),
+        (ReplayConfig(run=run, format="svg", output="a.png"), r"a file whose name ends in \.svg"),
+        (ReplayConfig(run=run, step=5), "step=5 is the step of a picture"),
         (ReplayConfig(run=run, format="svg", step=1000), "step=1000 is not flown"),
         (ReplayConfig(run=run, format="mp4", viewer=True), "a film shows one policy"),
     ):
