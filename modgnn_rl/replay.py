@@ -35,7 +35,7 @@ def refuse(config: ReplayConfig) -> None:
         RunFolder.open(folder)
     if config.output is not None:
         if Path(config.output).suffix.lower() != f".{config.format}":
-            raise InputError(f"output={config.output} must be a file whose name ends in .{config.format}, as format= says")
+            raise InputError(f"output={config.output} must be a file whose name ends in .{config.format}")
         if not Path(config.output).absolute().parent.is_dir():
             raise InputError(f"output={config.output} lies in a folder that does not exist; make it first")
     if config.step is not None and config.format not in ("svg", "png"):

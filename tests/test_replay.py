@@ -19,6 +19,7 @@ from modgnn_rl.evaluation import fly, reference_policies
 from modgnn_rl.experts import as_matrix
 from modgnn_rl.recording import METRICS, QUANTUM, Recorder, Recording, spacing
 from modgnn_rl.replay import refuse
+from modgnn_rl.replaying import record
 
 sys.path.insert(0, str(Path(__file__).parent))
 browser = importlib.import_module("browser")
@@ -136,7 +137,11 @@ def test_the_page_asks_for_nothing_and_shows_names_as_they_are(tmp_path):
 
 @pytest.mark.slow
 def test_two_flights_of_32_agents_and_1000_steps_take_less_than_a_megabyte(tmp_path):
-    assert _page(tmp_path, FlockingConfig(), agents=32, steps=1000).stat().st_size < 1_000_000
+    world, names = FlockingConfig(), ("expert", "LocalReynolds(hops=1)")
+    policies = reference_policies(world)
+    flights = {name: record(policies[name], world, num_agents=32, steps=1000, seed=5) for name in names}
+    replay_page.write_replay(tmp_path / "replay.html", flights, "two flights")
+    assert (tmp_path / "replay.html").stat().st_size < 1_000_000
 
 
 def test_what_cannot_be_done_is_said_in_one_sentence(tmp_path):
