@@ -14,7 +14,8 @@ browser = importlib.import_module("browser")
 
 SECONDS = 5
 COUNT = f"""new Promise((done) => {{
-  const drawn = state.drawn, begun = performance.now(), speed = () => (state.drawn - drawn) / (performance.now() - begun);
+  const drawn = state.drawn, begun = performance.now();
+  const speed = () => (state.drawn - drawn) / (performance.now() - begun);
   setTimeout(() => done(1000 * speed()), 1000 * Math.min({SECONDS}, 0.9 * LAST));
 }})"""
 
