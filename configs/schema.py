@@ -27,6 +27,7 @@ __all__ = [
     "ImitationConfig",
     "MAPPOConfig",
     "ModelConfig",
+    "ReplayConfig",
     "RunsConfig",
     "TrainConfig",
     "TrainerConfig",
@@ -454,6 +455,32 @@ class ExportConfig:
     run: str = setting(MISSING, "run folder")
     output: str | None = setting(None, "folder for the exported agent, made anew; null: agent/ in the run folder")
     threads: int = setting(1, "threads of torch where its latency is measured; 0: one a core", low=0)
+
+
+@dataclass
+class ReplayConfig:
+    """A flight to look at."""
+
+    run: str = setting(MISSING, "run folder")
+    checkpoint: str = setting("last", "which policy: the last, or the best while it trained", choices=("last", "best"))
+    env: Any = field(default_factory=WorldChanges)
+    others: Any = setting(None, "run folders whose policies fly the same flight, one or a list; null: none")
+    with_expert: bool = setting(True, "show the expert's flight from the same start too; not in a film")
+    num_agents: int | None = setting(None, "agents in the flock; null: as in training", low=1)
+    steps: int = setting(1000, "steps of the flight", low=1)
+    every: int | None = setting(
+        None, "of the steps flown, each how-manyth is kept; null: each, unless agents x steps are very many", low=1
+    )
+    seed: int = setting(1_000_000, "seed of start and leader", low=0, high=2**32)
+    format: str = setting(
+        "html", "a page that plays the flight, a film, or a picture of one step", choices=("html", "mp4", "svg", "png")
+    )
+    step: int | None = setting(None, "format=svg or png: the step that the picture shows; null: the last", low=0)
+    output: str | None = setting(None, "file to write; null: replay.<format> in the run folder")
+    viewer: bool = setting(False, "watch the flight in a browser while it is flown; needs modgnn-rl[viewer]")
+    port: int = setting(8080, "viewer=true: port on this machine", low=1, high=65535)
+    device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
+    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
 
 
 @dataclass

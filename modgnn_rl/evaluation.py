@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import Compose, InitTracker, TransformedEnv
@@ -121,6 +122,7 @@ def fly(
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
     expert: TensorDictModuleBase | None = None,
+    watch: Callable[[TensorDictBase], None] | None = None,
 ) -> Flights:
     """Fly fresh flocks with a policy to the end of the episode and measure them.
 
@@ -137,6 +139,7 @@ def fly(
         device: where to fly.
         progress: counts flock-steps.
         expert: what errors are measured against, writes ``("agents", "expert_action")``; default: Reynolds flocking.
+        watch: is shown the flocks before each step, with both actions; see `modgnn_rl.recording.Recorder`.
     """
     env = endless_env(policy, config, num_flocks, num_agents, steps=steps, seed=seed, device=device)
     expert = expert or Reynolds.for_env(config)
@@ -149,6 +152,8 @@ def fly(
         for step in range(steps):
             position = tensordict[config.state_key][..., :3]
             tensordict = expert(policy(tensordict))
+            if watch is not None:
+                watch(tensordict)
             agents = tensordict["agents"]
             error = action_error(agents["action"], agents["expert_action"], agents["controlled"])
             quarters[:, step * QUARTERS // steps] += error
@@ -213,10 +218,12 @@ def evaluate(
     seed: int,
     device: torch.device | str = "cpu",
     expert: TensorDictModuleBase | None = None,
+    watches: Mapping[str, Callable[[TensorDictBase], None]] | None = None,
 ) -> dict[str, Flights]:
     """Fly each policy, and the reference policies, from the same starts; progress is shown. See `fly`.
 
-    With an expert of one's own, the reference is it and doing nothing.
+    With an expert of one's own, the reference is it and doing nothing. ``watches``, by name of the policy, are shown
+    its flights.
     """
     policies = {**policies, **reference_policies(config, expert)}
     total = len(policies) * num_flocks * steps
@@ -234,5 +241,6 @@ def evaluate(
                 device=device,
                 progress=progress,
                 expert=expert,
+                watch=(watches or {}).get(name),
             )
     return flights

@@ -18,7 +18,7 @@ from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.settings import check
 
-__all__ = ["load_policy", "stored_model", "stored_world"]
+__all__ = ["changed_world", "load_policy", "stored_model", "stored_world"]
 
 
 def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", which: str = "last") -> ModGNN:
@@ -67,6 +67,27 @@ def stored_world(run: RunFolder) -> FlockingConfig:
     """
     world: FlockingConfig = _stored(run, "env", FlockingConfig)
     return world
+
+
+def changed_world(run: RunFolder, changes: Any) -> tuple[FlockingConfig, dict[str, Any]]:
+    """The world that a run was trained in, with some settings changed.
+
+    Args:
+        run: the run.
+        changes: a `modgnn_rl.configs.schema.WorldChanges`.
+
+    Returns:
+        the world, and by name the settings that are changed.
+
+    Raises:
+        InputError: a value of the wrong kind.
+    """
+    changed = {name: value for name, value in vars(changes).items() if value is not None}
+    try:
+        world: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(stored_world(run)), changed))
+    except OmegaConfBaseException as error:
+        raise InputError(f"env.{error.full_key}: {str(error.msg).splitlines()[0]}") from error
+    return world, changed
 
 
 def _stored(run: RunFolder, group: str, schema: type) -> Any:

@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl import distributed
@@ -23,9 +22,11 @@ from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingC
 from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation import evaluate
 from modgnn_rl.interruption import Interruption
-from modgnn_rl.loading import load_policy, stored_world
+from modgnn_rl.loading import changed_world, load_policy
 from modgnn_rl.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.recording import Recorder, spacing
+from modgnn_rl.replay_page import write_replay
 from modgnn_rl.resuming import begins_anew, changed_config, differences, stored_config
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.settings import check
@@ -40,6 +41,7 @@ from modgnn_rl.trainers.watching import Watch, log_evaluation
 
 __all__ = ["TRAINERS", "evaluate_policies", "evaluate_run", "prepare_torch", "resume", "train"]
 
+REPLAY_FRAMES = 250  # of the replay beside a table: keeping more would take longer than a second
 TRAINERS = {"bc": bc, "dagger": dagger, "mappo": mappo}
 
 
@@ -200,13 +202,16 @@ def evaluate_policies(
 ) -> dict[int, dict[str, Any]]:
     """Fly a run's policies and the reference policies, and write the table of each size into the run folder.
 
-    Tables of other sizes that the folder holds already are kept; a world changed since training has files of its own.
+    Beside it goes a replay of the first flock, flown by the policies and by the expert. Tables of other sizes that the
+    folder holds already are kept; a world changed since training has files of its own.
 
     Returns:
         for each number of agents, the table that `modgnn_rl.table.summarise_flights` makes.
     """
-    tables = {}
+    tables, replays = {}, {}
     for size in sizes:
+        every = spacing(size, settings.steps, REPLAY_FRAMES)
+        replays[size] = {name: Recorder(world, every) for name in (*policies, "expert")}
         flights = evaluate(
             policies,
             world,
@@ -216,6 +221,7 @@ def evaluate_policies(
             seed=settings.seed,
             device=device,
             expert=expert,
+            watches=replays[size],
         )
         tables[size] = summarise_flights(flights, settings.seed)
     flown = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
@@ -226,6 +232,11 @@ def evaluate_policies(
     entries = sorted({**read_tables(file), **new}.items(), key=lambda entry: int(entry[0]))
     run.write(file.name, json.dumps(dict(entries), indent=2) + "\n")
     run.write(file.with_suffix(".md").name, as_markdown(dict(entries), title))
+    for size, recorders in replays.items():
+        page = file.with_name(file.stem.replace("evaluation", f"replay-{size}", 1) + ".html")
+        recordings = {name: recorder.recording() for name, recorder in recorders.items()}
+        write_replay(page, recordings, title, {"seed": settings.seed, "flock": f"1 of {settings.num_flocks}"})
+        print(f"A flight of {size} agents to watch in a browser: {page}", flush=True)
     return tables
 
 
@@ -252,11 +263,7 @@ def evaluate_run(config: EvaluateConfig) -> Path:
     prepare_torch(config.device, config.threads)
     policy = load_policy(config.run, device=config.device, which=config.checkpoint)
     run = RunFolder.open(config.run)
-    changes = {name: value for name, value in vars(config.env).items() if value is not None}
-    try:
-        world: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(stored_world(run)), changes))
-    except OmegaConfBaseException as error:
-        raise InputError(f"env.{error.full_key}: {str(error.msg).splitlines()[0]}") from error
+    world, changes = changed_world(run, config.env)
     sizes = as_list(config.evaluation.num_agents or world.num_agents)
     best = {"checkpoint": "best"} if config.checkpoint == "best" else {}
     named = ",".join(f"{name}={value}" for name, value in sorted({**changes, **best}.items()))

@@ -1,0 +1,57 @@
+"""``python -m modgnn_rl.replay run=<folder>``: a flight of a run's policy to look at."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+from modgnn_rl.command import run_command
+from modgnn_rl.configs.schema import ReplayConfig, WorldChanges, as_list
+from modgnn_rl.errors import InputError
+from modgnn_rl.run_folder import RunFolder
+
+PACKAGES = {"html": (), "mp4": ("av", "matplotlib"), "svg": ("matplotlib",), "png": ("matplotlib",)}
+EXTRAS = {"mp4": "video", "svg": "plots", "png": "plots"}
+
+
+def main(config: ReplayConfig) -> None:
+    """Fly a flock with a trained policy, and write a page, a film or a picture of it, beside the expert's flight."""
+    refuse(config)
+    from modgnn_rl.replaying import replay_run
+
+    path = replay_run(config)
+    what = {"html": "flight", "mp4": "film"}.get(config.format, "picture")
+    opened = f"; open it in a browser, for example with: python -m webbrowser {path.as_uri()}"
+    print(f"The {what} is in {path}" + (opened if config.format == "html" else ""))
+
+
+def refuse(config: ReplayConfig) -> None:
+    """Find what cannot be done before the heavy imports.
+
+    Raises:
+        InputError: a folder that is not there, settings that do not go together, or a package that is not installed.
+    """
+    for folder in (config.run, *as_list(config.others or [])):
+        RunFolder.open(folder)
+    if config.output is not None:
+        if Path(config.output).suffix.lower() != f".{config.format}":
+            raise InputError(f"output={config.output} must be a file whose name ends in .{config.format}")
+        if not Path(config.output).absolute().parent.is_dir():
+            raise InputError(f"output={config.output} lies in a folder that does not exist; make it first")
+    if config.step is not None and config.format not in ("svg", "png"):
+        raise InputError(f"step={config.step} is the step of a picture; give format=svg or format=png, or leave it out")
+    if config.step is not None and config.step >= config.steps:
+        raise InputError(f"step={config.step} is not flown: there are steps={config.steps}, counted from 0")
+    if config.format == "mp4" and (config.others or config.viewer):
+        raise InputError("a film shows one policy; leave out others and viewer, or use format=html")
+    if missing := [name for name in PACKAGES[config.format] if importlib.util.find_spec(name) is None]:
+        extra = EXTRAS[config.format]
+        raise InputError(
+            f"format={config.format} needs {' and '.join(missing)}, not installed: pip install 'modgnn-rl[{extra}]'"
+        )
+    if config.viewer and importlib.util.find_spec("viser") is None:
+        raise InputError("viewer=true needs viser, which is not installed: pip install 'modgnn-rl[viewer]'")
+
+
+if __name__ == "__main__":
+    run_command(main, ReplayConfig, "replay", nodes={"env/changes": WorldChanges})

@@ -1,0 +1,159 @@
+"""From a run folder to a flight that can be looked at."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig, as_list
+from modgnn_rl.errors import InputError
+from modgnn_rl.evaluation import fly, reference_policies
+from modgnn_rl.loading import changed_world, load_policy
+from modgnn_rl.progress import Progress
+from modgnn_rl.recording import Recorder, Recording, spacing
+from modgnn_rl.replay_page import write_replay
+from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.settings import check
+from modgnn_rl.training import prepare_torch
+
+__all__ = ["record", "replay_run"]
+
+
+def replay_run(config: ReplayConfig) -> Path:
+    """Fly the policy of a run, the expert and the policies of other runs from one start, and write what it looks like.
+
+    Returns:
+        the file.
+
+    Raises:
+        InputError: a bad setting, no such run, no readable policy in it, or no such device.
+    """
+    check(config)
+    prepare_torch(config.device, config.threads)
+    run = RunFolder.open(config.run)
+    world, changes = changed_world(run, config.env)
+    if config.num_agents is None and len(world.sizes) > 1:
+        raise InputError(f"the run was trained with {world.sizes} agents; choose one size: num_agents={world.sizes[0]}")
+    agents = config.num_agents or world.sizes[0]
+    path = Path(config.output or run.path / f"replay.{config.format}").absolute()
+    policies = _policies(config, world)
+    name, policy = next(iter(policies.items()))
+    flight: dict[str, Any] = {
+        "num_agents": agents, "steps": config.steps, "seed": config.seed, "device": config.device
+    }  # fmt: skip
+    try:
+        if config.format == "mp4":
+            from modgnn_rl.videos import film, write_video
+
+            write_video(path, film(policy, world, **flight), world.control_frequency)
+            return path
+        every = config.every or spacing(agents, config.steps)
+        still = config.format in ("svg", "png")
+        shown = config.steps - 1 if config.step is None else config.step
+        if still:  # nothing after it is seen
+            every, flight["steps"] = 1, shown + 1
+        recordings = _fly_all(policies, world, every, config, flight)
+        facts = {"run": run.path.name, "flown": f"{agents} agents, {config.steps} steps, seed {config.seed}"}
+        facts |= {"checkpoint": config.checkpoint} | {f"env.{key}": value for key, value in changes.items()}
+        if still:
+            from modgnn_rl.replay_picture import write_picture
+
+            write_picture(path, recordings, shown)
+        else:
+            write_replay(path, recordings, f"{run.path.name}: {name}", facts)
+    except OSError as error:
+        raise InputError(f"cannot write {path} ({error.strerror}); give output=<a file that you can write>") from error
+    return path
+
+
+def _policies(config: ReplayConfig, world: FlockingConfig) -> dict[str, TensorDictModuleBase]:
+    """Who flies, by name: the run's policy first, then the expert, then others."""
+    folders = [config.run, *as_list(config.others or [])]
+    policies: dict[str, TensorDictModuleBase] = {}
+    for folder in folders:
+        run = RunFolder.open(folder)
+        name = str(run.config["model"]["name"])
+        if name in policies:
+            name = f"{name}, {run.path.name}"
+        policies[name] = load_policy(folder, device=config.device, which=config.checkpoint)
+        if config.with_expert and len(policies) == 1:
+            policies["expert"] = reference_policies(world)["expert"]
+    return policies
+
+
+def _fly_all(
+    policies: dict[str, TensorDictModuleBase],
+    world: FlockingConfig,
+    every: int,
+    config: ReplayConfig,
+    flight: dict[str, Any],
+) -> dict[str, Recording]:
+    """Record everybody's flight; the first one is shown while it is flown, where that is asked for."""
+    recordings: dict[str, Recording] = {}
+    with (
+        contextlib.ExitStack() as stack,
+        Progress("replay", len(policies) * flight["steps"]) as progress,
+    ):
+        for name, policy in policies.items():
+            progress.update(flying=name)
+            viewer = None
+            if config.viewer and not recordings:
+                from modgnn_rl.replay_viewer import Viewer
+
+                viewer = stack.enter_context(Viewer(world, config.port))
+            recordings[name] = record(policy, world, every=every, progress=progress, watch=viewer, **flight)
+    return recordings
+
+
+def record(
+    policy: TensorDictModuleBase,
+    world: FlockingConfig,
+    *,
+    num_agents: int,
+    steps: int,
+    seed: int,
+    every: int = 1,
+    device: str = "cpu",
+    progress: Progress | None = None,
+    watch: Callable[[TensorDictBase], None] | None = None,
+    expert: TensorDictModuleBase | None = None,
+) -> Recording:
+    """Fly one flock with a policy and keep what it looks like, for `modgnn_rl.replay_page.write_replay`.
+
+    Args:
+        policy: as `modgnn_rl.evaluation.fly` flies it.
+        world: the world.
+        num_agents: agents in the flock.
+        steps: steps of the flight, which goes on whatever happens to the flock.
+        seed: seed of start and leader.
+        every: of the steps flown, each how-manyth is kept.
+        device: where to fly.
+        progress: counts steps.
+        watch: is shown the flock before each step, too.
+        expert: what errors are measured against; default: Reynolds flocking.
+    """
+    recorder = Recorder(world, every)
+
+    def look(tensordict: TensorDictBase) -> None:
+        recorder(tensordict)
+        if watch is not None:
+            watch(tensordict)
+
+    fly(
+        policy,
+        world,
+        num_agents=num_agents,
+        num_flocks=1,
+        steps=steps,
+        seed=seed,
+        device=device,
+        progress=progress,
+        expert=expert,
+        watch=look,
+    )
+    return recorder.recording()
