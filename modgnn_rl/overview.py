@@ -17,6 +17,7 @@ HERE = Path(__file__).parent
 FIRST = {
     "train": "trainer.rounds=10 evaluation.num_flocks=10",
     "runs": "",
+    "replay": "'run=runs/<date>-<name>'",
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shlex
 from pathlib import Path
 
 from modgnn_rl.command import run_command
@@ -15,14 +16,24 @@ EXTRAS = {"mp4": "video", "svg": "plots", "png": "plots"}
 
 
 def main(config: ReplayConfig) -> None:
-    """Fly a flock with a trained policy, and write a page, a film or a picture of it, beside the expert's flight."""
+    """Fly a flock with a trained policy, and write a page, a film or a picture of it, beside the expert's flight.
+
+    Examples::
+
+        python -m modgnn_rl.replay 'run=runs/<date>-<name>'
+        python -m modgnn_rl.replay 'run=runs/<date>-<name>' num_agents=64 env.message_loss=0.3
+        python -m modgnn_rl.replay 'run=runs/<date>-<name>' format=svg step=400
+    """
     refuse(config)
     from modgnn_rl.replaying import replay_run
 
     path = replay_run(config)
     what = {"html": "flight", "mp4": "film"}.get(config.format, "picture")
-    opened = f"; open it in a browser, for example with: python -m webbrowser {path.as_uri()}"
-    print(f"The {what} is in {path}" + (opened if config.format == "html" else ""))
+    print(f"The {what} is in {path}")
+    if config.format == "html":
+        print(f"Next: python -m webbrowser {path.as_uri()}")
+    else:
+        print(f"Next, a page that plays it: python -m modgnn_rl.replay {shlex.quote(f'run={config.run}')}")
 
 
 def refuse(config: ReplayConfig) -> None:

@@ -227,11 +227,11 @@ def evaluate_policies(
     flown = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
     new = {str(size): {**flown, "rows": table} for size, table in tables.items()}
     title = f"{run.path.name} in a world with {changes}" if changes else run.path.name
-    print(f"\n{as_markdown(new, title)}", flush=True)
     file = evaluation_file(run, changes)
     entries = sorted({**read_tables(file), **new}.items(), key=lambda entry: int(entry[0]))
     run.write(file.name, json.dumps(dict(entries), indent=2) + "\n")
     run.write(file.with_suffix(".md").name, as_markdown(dict(entries), title))
+    print(f"\n{as_markdown(new, title)}", flush=True)
     for size, recorders in replays.items():
         page = file.with_name(file.stem.replace("evaluation", f"replay-{size}", 1) + ".html")
         recordings = {name: recorder.recording() for name, recorder in recorders.items()}
