@@ -25,7 +25,7 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, load_policy, make_model
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, EvaluationConfig, FlockingConfig, ModelConfig, TrainConfig
-from modgnn_rl.drawing import GRID, INK, MUTED, PAPER, draw, styles_of
+from modgnn_rl.drawing import GRID, INK, PAPER, draw, styles_of
 from modgnn_rl.evaluation import endless_env
 from modgnn_rl.experts import LocalReynolds, Reynolds
 from modgnn_rl.metrics import action_error, is_lost
@@ -129,11 +129,11 @@ def curves(values: Mapping[str, np.ndarray], world: FlockingConfig) -> dict[str,
 
 
 def trained(world: FlockingConfig, trainer: Any) -> ModGNN:
-    """A small ModGNN-MLP."""
+    """A policy whose robots hear over one link."""
     with tempfile.TemporaryDirectory() as runs:
         config = TrainConfig(
             env=world,
-            model=ModelConfig(name="modgnn_mlp"),
+            model=ModelConfig(name="pair_force"),
             trainer=trainer,
             evaluation=EvaluationConfig(num_flocks=2, steps=4),
             runs=runs,
@@ -144,17 +144,17 @@ def trained(world: FlockingConfig, trainer: Any) -> ModGNN:
 def compounding_errors() -> Callable[[Figure], None]:
     """Two policies of one model, cloned and trained by DAgger, on the expert's flights and on their own."""
     world = FlockingConfig(num_agents=16)
-    cloning = BCConfig(cloning_updates=CLONING_UPDATES, cloning_steps=500, receivers=2)
+    small: Any = {"num_envs": 8, "batch_size": 64}
     policies: dict[str, TensorDictModuleBase] = {
-        "cloned": trained(world, cloning),
-        "DAgger": trained(world, DAggerConfig(rounds=DAGGER_ROUNDS, receivers=2)),
+        "cloned": trained(world, BCConfig(cloning_updates=2000, **small)),
+        "DAgger": trained(world, DAggerConfig(cloning_updates=400, rounds=40, round_updates=40, **small)),
         "expert, 1 hop": LocalReynolds.for_env(world, action=ACTION),
     }
     titles = {"on the expert's flights": True, "on flights of its own": False}
     panels = {}
     for title, flown_by_expert in titles.items():
         found = {
-            name: errors(policy, world, flocks=50, steps=1000, flown_by_expert=flown_by_expert)[0]
+            name: errors(policy, world, flocks=24, steps=1000, flown_by_expert=flown_by_expert)[0]
             for name, policy in policies.items()
         }
         for name, values in found.items():
@@ -162,7 +162,7 @@ def compounding_errors() -> Callable[[Figure], None]:
         panels[title] = curves(found, world)
 
     def onto(figure: Figure) -> None:
-        for panel, (title, drawn) in zip(draw_panels(figure, list(titles)), panels.items(), strict=True):
+        for panel, drawn in zip(draw_panels(figure, list(titles)), panels.values(), strict=True):
             draw_curves(
                 panel,
                 drawn,
@@ -170,7 +170,7 @@ def compounding_errors() -> Callable[[Figure], None]:
                 y_label="error, m²/s²",
                 references={"zero action": world.max_speed**2 / 3},
             )
-            panel.axes[0].set_ylim(0, TOP)
+            panel.axes[0].set_ylim(0, 0.3)
 
     return onto
 
@@ -185,12 +185,14 @@ def local_policies() -> Callable[[Figure], None]:
     }
     flown = {name: errors(expert, world, flocks=100, steps=1000) for name, expert in experts.items()}
     for name, (error, lost) in flown.items():
-        print(f"{name}: error {error.mean():.3f} m²/s², at the end {error[:, -1].mean():.3f}, lost {lost[:, -1].mean():.0%}")
+        print(f"{name}: {error.mean():.3f} m²/s², at the end {error[:, -1].mean():.3f}, lost {lost[:, -1].mean():.0%}")
     errors_of = curves({name: error for name, (error, _) in flown.items()}, world)
     lost_of = curves({name: 100 * lost for name, (_, lost) in flown.items()}, world)
 
     def onto(figure: Figure) -> None:
-        left, right = draw_panels(figure, ["error against the expert that sees all", "flocks whose leader nobody hears"])
+        left, right = draw_panels(
+            figure, ["error against the expert that sees all", "flocks whose leader nobody hears"]
+        )
         draw_curves(left, errors_of, x_label="time, s", y_label="error, m²/s²")
         draw_curves(right, lost_of, x_label="time, s", y_label="share, %")
 
@@ -202,8 +204,6 @@ FIGURES: dict[str, Callable[[], Callable[[Figure], None]]] = {
     "compounding-errors": compounding_errors,
     "local-policies": local_policies,
 }
-CLONING_UPDATES, DAGGER_ROUNDS = 3000, 40
-TOP = 0.6  # m^2/s^2
 
 
 def main(names: list[str]) -> None:
