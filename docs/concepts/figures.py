@@ -2,9 +2,10 @@
 
     python docs/concepts/figures.py
     python docs/concepts/figures.py delayed-messages local-policies
+    python docs/concepts/figures.py compounding-errors --cloned runs/<date>-<name> --dagger runs/<date>-<name>
 
-All of them take about six minutes on one core; the two trainings of compounding-errors take most of it. Needs
-matplotlib (``pip install -e '.[plots]'``).
+All of them take about six minutes on one core; the two trainings of compounding-errors take most of it, unless the run
+folders of finished ones are given. Needs matplotlib (``pip install -e '.[plots]'``).
 """
 
 from __future__ import annotations
@@ -128,8 +129,10 @@ def curves(values: Mapping[str, np.ndarray], world: FlockingConfig) -> dict[str,
     }
 
 
-def trained(world: FlockingConfig, trainer: Any) -> ModGNN:
-    """A policy whose robots hear over one link."""
+def trained(world: FlockingConfig, trainer: Any, finished: Path | None) -> ModGNN:
+    """A policy whose robots hear over one link, of a finished run or trained now."""
+    if finished is not None:
+        return load_policy(finished)
     with tempfile.TemporaryDirectory() as runs:
         config = TrainConfig(
             env=world,
@@ -141,13 +144,13 @@ def trained(world: FlockingConfig, trainer: Any) -> ModGNN:
         return load_policy(train(config).path)
 
 
-def compounding_errors() -> Callable[[Figure], None]:
+def compounding_errors(cloned: Path | None = None, dagger: Path | None = None) -> Callable[[Figure], None]:
     """Two policies of one model, cloned and trained by DAgger, on the expert's flights and on their own."""
     world = FlockingConfig(num_agents=16)
     small: Any = {"num_envs": 8, "batch_size": 64}
     policies: dict[str, TensorDictModuleBase] = {
-        "cloned": trained(world, BCConfig(cloning_updates=2000, **small)),
-        "DAgger": trained(world, DAggerConfig(cloning_updates=400, rounds=40, round_updates=40, **small)),
+        "cloned": trained(world, BCConfig(cloning_updates=2000, **small), cloned),
+        "DAgger": trained(world, DAggerConfig(cloning_updates=400, rounds=40, round_updates=40, **small), dagger),
         "expert, 1 hop": LocalReynolds.for_env(world, action=ACTION),
     }
     titles = {"on the expert's flights": True, "on flights of its own": False}
@@ -199,23 +202,26 @@ def local_policies() -> Callable[[Figure], None]:
     return onto
 
 
-FIGURES: dict[str, Callable[[], Callable[[Figure], None]]] = {
-    "delayed-messages": lambda: delayed_messages,
-    "compounding-errors": compounding_errors,
-    "local-policies": local_policies,
-}
+NAMES = ("delayed-messages", "compounding-errors", "local-policies")
 
 
-def main(names: list[str]) -> None:
+def main(names: list[str], cloned: Path | None = None, dagger: Path | None = None) -> None:
     """Make some figures, or all."""
     torch.set_num_threads(1)
-    for name in names or FIGURES:
-        picture = draw(name, FIGURES[name]()).png
+    made: dict[str, Callable[[], Callable[[Figure], None]]] = {
+        "delayed-messages": lambda: delayed_messages,
+        "compounding-errors": lambda: compounding_errors(cloned, dagger),
+        "local-policies": local_policies,
+    }
+    for name in names or NAMES:
+        picture = draw(name, made[name]()).png
         (HERE / f"{name}.png").write_bytes(picture)
         print(f"{name}.png, {len(picture) / 1000:.0f} kB")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", choices=[*FIGURES, []], help="which; default: all")
-    main(parser.parse_args().names)
+    parser.add_argument("names", nargs="*", choices=[*NAMES, []], help="which; default: all")
+    parser.add_argument("--cloned", type=Path, help="run folder of trainer=bc")
+    parser.add_argument("--dagger", type=Path, help="run folder of trainer=dagger, of the same model")
+    main(**vars(parser.parse_args()))
