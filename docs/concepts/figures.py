@@ -150,14 +150,14 @@ def compounding_errors(cloned: Path | None = None, dagger: Path | None = None) -
     small: Any = {"num_envs": 8, "batch_size": 64}
     policies: dict[str, TensorDictModuleBase] = {
         "cloned": trained(world, BCConfig(cloning_updates=2000, **small), cloned),
-        "DAgger": trained(world, DAggerConfig(cloning_updates=400, rounds=40, round_updates=40, **small), dagger),
+        "DAgger": trained(world, DAggerConfig(cloning_updates=200, rounds=20, round_updates=20, **small), dagger),
         "expert, 1 hop": LocalReynolds.for_env(world, action=ACTION),
     }
     titles = {"on the expert's flights": True, "on flights of its own": False}
     panels = {}
     for title, flown_by_expert in titles.items():
         found = {
-            name: errors(policy, world, flocks=24, steps=1000, flown_by_expert=flown_by_expert)[0]
+            name: errors(policy, world, flocks=16, steps=1000, flown_by_expert=flown_by_expert)[0]
             for name, policy in policies.items()
         }
         for name, values in found.items():
