@@ -157,7 +157,7 @@ def compounding_errors(cloned: Path | None = None, dagger: Path | None = None) -
     panels = {}
     for title, flown_by_expert in titles.items():
         found = {
-            name: errors(policy, world, flocks=16, steps=1000, flown_by_expert=flown_by_expert)[0]
+            name: errors(policy, world, flocks=24, steps=800, flown_by_expert=flown_by_expert)[0]
             for name, policy in policies.items()
         }
         for name, values in found.items():
