@@ -4,7 +4,7 @@
     python docs/concepts/figures.py delayed-messages local-policies
     python docs/concepts/figures.py compounding-errors --cloned runs/<date>-<name> --dagger runs/<date>-<name>
 
-All of them take about six minutes on one core; the two trainings of compounding-errors take most of it, unless the run
+All of them take some minutes on one core; the two trainings of compounding-errors take most of it, unless the run
 folders of finished ones are given. Needs matplotlib (``pip install -e '.[plots]'``).
 """
 
