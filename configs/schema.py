@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
+from importlib.metadata import entry_points
 from typing import Any
 
 from omegaconf import MISSING
@@ -37,7 +38,7 @@ __all__ = [
 ]
 
 
-MODEL_NAMES = (
+BUILT_IN_MODELS = (
     "moment_force",
     "pair_force",
     "modgnn_mlp",
@@ -50,6 +51,8 @@ MODEL_NAMES = (
     "gat",
     "mpnn",
 )
+MODEL_PLUGINS = "modgnn_rl.models"  # group of the entry points by which installed packages bring models
+MODEL_NAMES = [*BUILT_IN_MODELS, *sorted(entry_points(group=MODEL_PLUGINS).names)]  # register_model adds to it
 LOGGER_NAMES = ("none", "csv", "tensorboard", "wandb")
 REFERENCE_SIZE = 32  # the flock size to which start_radius, num_envs and receivers refer
 

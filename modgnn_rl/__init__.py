@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from modgnn_rl.agent import Agent
     from modgnn_rl.loading import load_policy
-    from modgnn_rl.models import make_model
+    from modgnn_rl.models import make_model, register_model
     from modgnn_rl.modgnn import ModGNN, ModGNNLayer
 
 __version__ = "0.1.0"
-__all__ = ["Agent", "ModGNN", "ModGNNLayer", "__version__", "load_policy", "make_model"]
+__all__ = ["Agent", "ModGNN", "ModGNNLayer", "__version__", "load_policy", "make_model", "register_model"]
 
 _HOMES = {
     "Agent": "modgnn_rl.agent",
@@ -24,6 +24,7 @@ _HOMES = {
     "ModGNNLayer": "modgnn_rl.modgnn",
     "load_policy": "modgnn_rl.loading",
     "make_model": "modgnn_rl.models",
+    "register_model": "modgnn_rl.models",
 }
 
 

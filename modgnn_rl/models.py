@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from typing import Any, NamedTuple
 
 import torch
@@ -20,7 +21,7 @@ from torch import Tensor, nn
 
 from modgnn_rl.central import CentralLayer
 from modgnn_rl.communication import Adjacency, GraphAttention, MessagePassing
-from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
+from modgnn_rl.configs.schema import BUILT_IN_MODELS, MODEL_NAMES, MODEL_PLUGINS, FlockingConfig, ModelConfig
 from modgnn_rl.equivariant import VELOCITY_SCALE, Moments, PairForce, VectorSquash, mlp
 from modgnn_rl.errors import InputError
 from modgnn_rl.modgnn import ModGNN, ModGNNLayer
@@ -28,7 +29,17 @@ from modgnn_rl.seeds import seeded
 from modgnn_rl.settings import suggestion
 from modgnn_rl.tensors import clip_to_ball
 
-__all__ = ["MODELS", "BallHead", "LayerSpec", "PairForce", "Scale", "Zero", "configured_model", "make_model"]
+__all__ = [
+    "MODELS",
+    "BallHead",
+    "LayerSpec",
+    "PairForce",
+    "Scale",
+    "Zero",
+    "configured_model",
+    "make_model",
+    "register_model",
+]
 
 POSITION_SCALE = 0.5  # 1/m
 LATENT = 10  # width of f_pre's and f_mid's outputs in the paper
@@ -250,7 +261,8 @@ def _sum_of_forces(spec: LayerSpec, vectors: int, scalars: int, features: tuple[
     return ModGNNLayer(spec.hops, f_pre=f_pre, f_final=f_final)
 
 
-MODELS: dict[str, Callable[[LayerSpec], ModGNNLayer | CentralLayer]] = {
+Builder = Callable[[LayerSpec], ModGNNLayer | CentralLayer]
+MODELS: dict[str, Builder] = {
     "moment_force": moment_force,
     "pair_force": pair_force,
     "modgnn_mlp": modgnn_mlp,
@@ -268,6 +280,38 @@ MODELS: dict[str, Callable[[LayerSpec], ModGNNLayer | CentralLayer]] = {
 LAYERS = {"moment_force": 2}  # of models that have not one
 
 
+def register_model(name: str, builder: Builder) -> None:
+    """Give a model of one's own a name, by which settings, trainers and run folders know it in this process.
+
+    A package does so for every command, without a call, with an entry point in its ``pyproject.toml``::
+
+        [project.entry-points."modgnn_rl.models"]
+        my_model = "my_package.my_module:my_model"
+
+    Args:
+        name: a new name, or one that was registered before: the new builder replaces the old one.
+        builder: builds one layer; see `LayerSpec`. `make_model` calls it for each.
+
+    Raises:
+        InputError: the name is that of a model which is built in.
+    """
+    if name in BUILT_IN_MODELS:
+        raise InputError(f"model '{name}' is built in; give your own another name")
+    MODELS[name] = builder
+    if name not in MODEL_NAMES:
+        MODEL_NAMES.append(name)
+
+
+def _builder(name: str) -> Builder:
+    """What builds a model's layers; an installed package's is imported now."""
+    if name not in MODELS:
+        for entry in entry_points(group=MODEL_PLUGINS, name=name):
+            register_model(name, entry.load())
+    if name not in MODELS:
+        raise InputError(f"model '{name}' is not one of {', '.join(MODEL_NAMES)}{suggestion(name, MODEL_NAMES)}")
+    return MODELS[name]
+
+
 def make_model(
     name: str,
     hops: int = 1,
@@ -282,7 +326,7 @@ def make_model(
     """Build a model by name.
 
     Args:
-        name: one of `MODELS`.
+        name: one of `MODELS`, or of an installed package's; see `register_model`.
         hops: number of communication hops K, of each layer.
         hidden: width of the hidden layers.
         layers: number of layers L; with several, an agent hears of others over L K links, one step late for each.
@@ -298,8 +342,7 @@ def make_model(
     Raises:
         InputError: for an unknown name, or a number that cannot be.
     """
-    if name not in MODELS:
-        raise InputError(f"model '{name}' is not one of {', '.join(MODELS)}{suggestion(name, MODELS)}")
+    builder = _builder(name)
     if layers is None:
         layers = LAYERS.get(name, 1)
     if not isinstance(layers, int) or layers < 1:
@@ -308,7 +351,7 @@ def make_model(
         built = []
         for earlier in range(layers):
             head = BallHead(max_speed) if earlier == layers - 1 else None
-            built.append(MODELS[name](LayerSpec(hops, hidden, earlier, head, num_agents)))
+            built.append(builder(LayerSpec(hops, hidden, earlier, head, num_agents)))
         return ModGNN(built, **keys)
 
 

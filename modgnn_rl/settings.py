@@ -16,7 +16,7 @@ import copy
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from modgnn_rl.errors import InputError
@@ -31,7 +31,7 @@ def setting(
     low: float | None = None,
     above: float | None = None,
     high: float | None = None,
-    choices: Iterable[Any] | None = None,
+    choices: Sequence[Any] | None = None,
     whole: bool = False,
     length: int | None = None,
 ) -> Any:
@@ -43,12 +43,12 @@ def setting(
         low: smallest legal value.
         above: exclusive lower bound.
         high: largest legal value.
-        choices: the legal values, where they can be listed.
+        choices: the legal values, where they can be listed; a list may grow later.
         whole: accept whole numbers and lists of them only; for settings that may be either.
         length: length of a list.
     """
     metadata: dict[str, Any] = {"doc": doc, "low": low, "above": above, "high": high, "whole": whole, "length": length}
-    metadata["choices"] = None if choices is None else tuple(choices)
+    metadata["choices"] = choices
     if isinstance(default, list):
         return dataclasses.field(default_factory=lambda: copy.copy(default), metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)

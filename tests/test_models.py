@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,30 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
-from modgnn_rl.configs.schema import MODEL_NAMES, FlockingConfig, ModelConfig
+from modgnn_rl import load_policy
+from modgnn_rl.configs.schema import (
+    MODEL_NAMES,
+    MODEL_PLUGINS,
+    DAggerConfig,
+    EvaluationConfig,
+    FlockingConfig,
+    ModelConfig,
+    TrainConfig,
+)
 from modgnn_rl.equivariant import VectorSquash
 from modgnn_rl.errors import InputError
-from modgnn_rl.models import MODELS, BallHead, PairForce, Scale, configured_model, make_model
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.models import (
+    MODELS,
+    BallHead,
+    LayerSpec,
+    PairForce,
+    Scale,
+    configured_model,
+    make_model,
+    register_model,
+)
+from modgnn_rl.modgnn import ModGNN, ModGNNLayer
+from modgnn_rl.training import train
 
 seeds = st.integers(0, 999)
 local_models = pytest.mark.parametrize("name", [name for name in MODELS if name != "central"])
@@ -179,7 +200,45 @@ def test_the_table_of_models_in_the_documentation_is_true() -> None:
 
 
 def test_names_in_the_settings_are_the_models() -> None:
-    assert tuple(MODELS) == MODEL_NAMES
+    assert list(MODELS) == MODEL_NAMES
+
+
+def shared_hops(spec: LayerSpec) -> ModGNNLayer:
+    return ModGNNLayer(spec.hops, f_pre=Scale(), f_mid=nn.Linear(6, 4), f_final=spec.end(nn.Linear(4, spec.outputs)))
+
+
+@pytest.fixture
+def own_names() -> Iterator[None]:
+    names = list(MODEL_NAMES)
+    yield
+    for name in set(MODEL_NAMES) - set(names):
+        MODELS.pop(name)
+    MODEL_NAMES[:] = names
+
+
+def test_a_model_of_ones_own_is_trained_and_loaded_by_its_name(own_names: None, tmp_path: Path) -> None:
+    register_model("shared_hops", shared_hops)
+    register_model("shared_hops", shared_hops)  # as a cell of a notebook that is run again
+    assert make_model("shared_hops", hops=3).num_parameters == make_model("shared_hops").num_parameters
+    run = train(
+        TrainConfig(
+            env=FlockingConfig(num_agents=4),
+            model=ModelConfig(name="shared_hops"),
+            trainer=DAggerConfig(rounds=1, num_envs=2, cloning_steps=10, cloning_updates=2, round_updates=2),
+            evaluation=EvaluationConfig(num_flocks=2, steps=4),
+            runs=str(tmp_path),
+        )
+    )
+    assert load_policy(run.path).layers[0].hops == 1
+    with pytest.raises(InputError, match="model 'gcn' is built in; give your own another name"):
+        register_model("gcn", shared_hops)
+
+
+def test_an_installed_package_brings_models(own_names: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = EntryPoint("plugged", "modgnn_rl.models:gcn", MODEL_PLUGINS)
+    monkeypatch.setattr("modgnn_rl.models.entry_points", lambda **_: EntryPoints([entry]))
+    assert make_model("plugged", seed=0).state_dict().keys() == make_model("gcn").state_dict().keys()
+    assert "plugged" in MODEL_NAMES
 
 
 @torch.no_grad()
