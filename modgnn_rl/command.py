@@ -57,7 +57,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.interruption import Stopped
 from modgnn_rl.settings import check, suggestion
 
-__all__ = ["run_command", "settings_given"]
+__all__ = ["FLAGS", "legal_values", "run_command", "settings_given"]
 
 Config = TypeVar("Config")
 
@@ -325,7 +325,7 @@ def _setting_lines(config: DictConfig, prefix: str = "") -> Iterator[str]:
             value = typing.cast(dict[str, Any], raw)[field.name]
             shown = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
             head = f"  {prefix}{field.name}={'<required>' if value == '???' else shown}"
-            text = f"{field.metadata.get('doc', '')}{_range(field.metadata)}"
+            text = f"{field.metadata.get('doc', '')}{legal_values(field.metadata)}"
             indent = " " * 40
             body = textwrap.fill(text, 120, initial_indent=indent, subsequent_indent=indent)
             yield head + body[len(head) :] if len(head) < len(indent) - 1 else f"{head}\n{body}".rstrip()
@@ -333,7 +333,7 @@ def _setting_lines(config: DictConfig, prefix: str = "") -> Iterator[str]:
         yield from _setting_lines(child, f"{prefix}{key}.")
 
 
-def _range(rule: Mapping[str, Any]) -> str:
+def legal_values(rule: Mapping[str, Any]) -> str:
     """Return the legal values of a setting in brackets, or an empty string."""
     if rule.get("choices"):
         return f" [{', '.join(map(str, rule['choices']))}]"
