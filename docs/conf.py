@@ -5,22 +5,21 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-import generate
-
 import modgnn_rl
+
+DOCS = Path(__file__).parent
 
 project = "modgnn_rl"
 author = "The modgnn-rl authors"
 release = version = modgnn_rl.__version__
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb", "sphinx_copybutton"]
 exclude_patterns = ["_static", "**.ipynb_checkpoints"]
-suppress_warnings = ["toc.empty_glob"]  # whole chapters may be absent from a checkout
+suppress_warnings = ["ref.python"]  # names that are imported for type checkers alone are looked up by their last part
 
 # Pages are written for GitHub too: headings are linked to by the names that GitHub gives them.
 myst_heading_anchors = 4
@@ -50,5 +49,22 @@ copybutton_exclude = ".linenos, .gp, .go"
 
 
 def setup(app: Any) -> None:
-    """Make the pages that come from the configuration before Sphinx looks for pages."""
-    app.connect("builder-inited", lambda app: generate.write_reference(Path(app.srcdir) / "reference"))
+    """Make the pages that come from the configuration, and mend what Sphinx reads otherwise than people do."""
+    sys.path.insert(0, str(DOCS))
+    from generate import write_reference
+
+    app.connect("builder-inited", lambda app: write_reference(DOCS / "reference"))
+    app.connect("source-read", drop_empty_globs)
+    app.connect("autodoc-process-docstring", escape_shapes, priority=400)  # before napoleon
+
+
+def drop_empty_globs(app: Any, name: str, source: list[str]) -> None:
+    """Take patterns that match no page out of the tables of contents, where Sphinx would warn of them."""
+    source[0] = re.sub(
+        r"^([\w/-]+\*)\n", lambda line: line[0] if any(DOCS.glob(line[1])) else "", source[0], flags=re.M
+    )
+
+
+def escape_shapes(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Keep the asterisk of a shape such as [*B, N] from beginning emphasis."""
+    lines[:] = [re.sub(r"(?<=[\[, ])\*(?=[A-Z,\]])(?![^`]*``)", r"\\*", line) for line in lines]

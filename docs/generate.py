@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import json
 import re
@@ -56,6 +57,7 @@ class Section:
     presets: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
 
 
+@functools.cache
 def commands() -> list[Command]:
     """Every command, in alphabetical order."""
     found = []
@@ -85,14 +87,15 @@ def reference_pages() -> dict[str, str]:
     return {"commands.md": _commands_page(known, sections), "settings.md": _settings_page(sections)}
 
 
-def _groups(command: Command) -> dict[str, str]:
+def groups_of(command: Command) -> dict[str, str]:
     """The choice that a command makes by default, by group."""
     return {
         group: choice for entry in _defaults(command.name) if isinstance(entry, dict) for group, choice in entry.items()
     }
 
 
-def _choices(group: str) -> list[str]:
+def choices_of(group: str) -> list[str]:
+    """The choices of a group, in alphabetical order."""
     return sorted(file.stem for file in (CONFIGS / group).glob("*.yaml"))
 
 
@@ -105,7 +108,7 @@ def _yaml(name: str) -> dict[str, Any]:
     return yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")) or {}
 
 
-def _preset(command: Command, group: str, choice: str) -> tuple[type | None, dict[str, Any]]:
+def preset_of(command: Command, group: str, choice: str) -> tuple[type | None, dict[str, Any]]:
     """The dataclass of a choice, if it has one of its own, and what it sets that is not the default."""
     typed = {f"/{key.replace('/', '_')}_schema@_here_": node for key, node in command.nodes.items()}
     kind: type | None = None
@@ -114,7 +117,7 @@ def _preset(command: Command, group: str, choice: str) -> tuple[type | None, dic
         if entry in typed:
             kind = typed[entry]
         elif entry != "_self_":  # another choice that this one begins with
-            kind, values = _preset(command, group, entry)
+            kind, values = preset_of(command, group, entry)
     return kind, values | {key: value for key, value in _yaml(f"{group}/{choice}").items() if key != "defaults"}
 
 
@@ -128,13 +131,13 @@ def _sections(known: Iterable[Command]) -> list[Section]:
         return section
 
     for command in known:
-        groups = _groups(command)
+        groups = groups_of(command)
         section_of(command, "", command.schema)
         hints = typing.get_type_hints(command.schema)
         for field in dataclasses.fields(command.schema):
             kind: Any = hints[field.name] if dataclasses.is_dataclass(hints[field.name]) else field.default_factory
-            for choice in _choices(field.name) if field.name in groups else []:
-                own, values = _preset(command, field.name, choice)
+            for choice in choices_of(field.name) if field.name in groups else []:
+                own, values = preset_of(command, field.name, choice)
                 values.pop("name", None)  # of the choice itself
                 section_of(command, field.name, own or kind).presets[f"{field.name}={choice}"] = values
             if field.name not in groups and dataclasses.is_dataclass(kind):
@@ -154,13 +157,13 @@ def _commands_page(known: list[Command], sections: list[Section]) -> str:
     lines += [f"| [`python -m modgnn_rl.{c.name}`](#{c.name}) | {_cell(_summary(c))} |" for c in known]
     for command in known:
         lines += ["", f"## {command.name}", "", _summary(command), "", "```text"]
-        groups = _groups(command)
+        groups = groups_of(command)
         chooses = " [group=choice ...]" if groups else ""
         lines += [f"python -m modgnn_rl.{command.name}{chooses} [setting=value ...] [flags]", "```", ""]
         if groups:
             lines += ["| group | choices, the default in bold |", "|---|---|"]
         for group, chosen in groups.items():
-            shown = ", ".join(f"**`{choice}`**" if choice == chosen else f"`{choice}`" for choice in _choices(group))
+            shown = ", ".join(f"**`{choice}`**" if choice == chosen else f"`{choice}`" for choice in choices_of(group))
             lines.append(f"| `{group}=` | {shown} |")
         here = [section for section in sections if command.name in section.commands]
         own = next(section for section in here if section.kind is command.schema)
