@@ -48,7 +48,7 @@ class Dynamics:
         period: control period, s.
         substeps: physics steps in it.
         velocity_gain: proportional gain of the velocity controller, 1/s.
-        linear_damping: Bullet's damping d of velocities, a = -d v (1 + |v|).
+        linear_damping: Bullet's damping d of velocities, ``a = -d v (1 + |v|)``.
         angular_damping: Bullet's damping d of angular velocities.
         drag: multiple of the vehicle's rotor drag; 0: none.
         motor_lag: time constant of the rotors, s; 0: none.

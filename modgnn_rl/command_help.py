@@ -15,7 +15,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from omegaconf import DictConfig, OmegaConf
 
-__all__ = ["children", "fields", "help_text"]
+__all__ = ["FLAGS", "children", "fields", "help_text", "legal_values"]
 
 FLAGS = {
     "--multirun": "one run for every combination of comma-separated values, as in seed=0,1,2",
@@ -82,7 +82,7 @@ def _settings(config: DictConfig, width: int, prefix: str = "") -> Iterator[list
             value = raw[field.name]
             shown = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
             head = f"{prefix}{field.name}={'<required>' if value == '???' else shown}"
-            lines.append(_entry(head, f"{field.metadata.get('doc', '')}{_range(field.metadata)}", width))
+            lines.append(_entry(head, f"{field.metadata.get('doc', '')}{legal_values(field.metadata)}", width))
     yield lines
     # The shortest first: the long list of the world's would hide the others.
     for name in sorted(nested, key=lambda name: len(nested[name])):
@@ -104,7 +104,7 @@ def _entry(head: str, text: str, width: int) -> str:
     return head + body[len(head) :] if len(head) < len(indent) - 1 else f"{head}\n{body}".rstrip()
 
 
-def _range(rule: Mapping[str, Any]) -> str:
+def legal_values(rule: Mapping[str, Any]) -> str:
     """The legal values of a setting in brackets, or an empty string."""
     if rule.get("choices"):
         return f" [{', '.join(map(str, rule['choices']))}]"

@@ -1,0 +1,70 @@
+"""Sphinx: the documentation site, from the pages of this folder, the docstrings, and the configuration.
+
+.venv/bin/sphinx-build -W --keep-going docs build/docs
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import modgnn_rl
+
+DOCS = Path(__file__).parent
+
+project = "modgnn_rl"
+author = "The modgnn-rl authors"
+release = version = modgnn_rl.__version__
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb", "sphinx_copybutton"]
+exclude_patterns = ["_static", "**.ipynb_checkpoints"]
+suppress_warnings = ["ref.python"]  # names that are imported for type checkers alone are looked up by their last part
+
+# Pages are written for GitHub too: headings are linked to by the names that GitHub gives them.
+myst_heading_anchors = 4
+myst_enable_extensions = ["attrs_inline", "colon_fence"]
+nb_execution_mode = "off"  # notebooks are stored with their results; the tests run them
+
+# In docstrings, `name` leads to what it names, where that is documented.
+default_role = "py:obj"
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_class_signature = "mixed"
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+python_maximum_signature_line_length = 80
+add_module_names = False
+toc_object_entries_show_parents = "hide"
+
+html_theme = "furo"
+html_title = "modgnn_rl"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sphinx = False
+html_theme_options = {"navigation_with_keys": True}
+copybutton_exclude = ".linenos, .gp, .go"
+
+
+def setup(app: Any) -> None:
+    """Make the pages that come from the configuration, and mend what Sphinx reads otherwise than people do."""
+    sys.path.insert(0, str(DOCS))
+    from generate import write_reference
+
+    app.connect("builder-inited", lambda app: write_reference(DOCS / "reference"))
+    app.connect("source-read", drop_empty_globs)
+    app.connect("autodoc-process-docstring", escape_shapes, priority=400)  # before napoleon
+
+
+def drop_empty_globs(app: Any, name: str, source: list[str]) -> None:
+    """Take patterns that match no page out of the tables of contents, where Sphinx would warn of them."""
+    source[0] = re.sub(
+        r"^([\w/-]+\*)\n", lambda line: line[0] if any(DOCS.glob(line[1])) else "", source[0], flags=re.M
+    )
+
+
+def escape_shapes(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Keep the asterisk of a shape such as [*B, N] from beginning emphasis."""
+    lines[:] = [re.sub(r"(?<=[\[, ])\*(?=[A-Z,\]])(?![^`]*``)", r"\\*", line) for line in lines]
