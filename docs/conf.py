@@ -5,10 +5,13 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 from pathlib import Path
 from typing import Any
+
+from sphinx.util.inspect import stringify_signature
 
 import modgnn_rl
 
@@ -23,7 +26,7 @@ suppress_warnings = ["ref.python"]  # names that are imported for type checkers 
 
 # Pages are written for GitHub too: headings are linked to by the names that GitHub gives them.
 myst_heading_anchors = 4
-myst_enable_extensions = ["attrs_inline", "colon_fence"]
+myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence"]
 nb_execution_mode = "off"  # notebooks are stored with their results; the tests run them
 
 # In docstrings, `name` leads to what it names, where that is documented.
@@ -49,22 +52,34 @@ copybutton_exclude = ".linenos, .gp, .go"
 
 
 def setup(app: Any) -> None:
-    """Make the pages that come from the configuration, and mend what Sphinx reads otherwise than people do."""
+    """Make the pages that are generated, and mend what Sphinx reads otherwise than GitHub does."""
     sys.path.insert(0, str(DOCS))
     from generate import write_reference
 
     app.connect("builder-inited", lambda app: write_reference(DOCS / "reference"))
-    app.connect("source-read", drop_empty_globs)
+    app.connect("source-read", mend_links)
+    app.connect("autodoc-process-signature", signature_of_init)
     app.connect("autodoc-process-docstring", escape_shapes, priority=400)  # before napoleon
 
 
-def drop_empty_globs(app: Any, name: str, source: list[str]) -> None:
-    """Take patterns that match no page out of the tables of contents, where Sphinx would warn of them."""
-    source[0] = re.sub(
-        r"^([\w/-]+\*)\n", lambda line: line[0] if any(DOCS.glob(line[1])) else "", source[0], flags=re.M
-    )
+def mend_links(app: Any, name: str, source: list[str]) -> None:
+    """Lead links to the README and its like to their pages here, and drop patterns that match no page."""
+    text = re.sub(r"\]\((?:\.\./)+([A-Z]+)\.md", lambda link: f"](/reference/{link[1].lower()}.md", source[0])
+    source[0] = re.sub(r"^([\w/-]+\*)\n", lambda line: line[0] if any(DOCS.glob(line[1])) else "", text, flags=re.M)
 
 
 def escape_shapes(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Keep the asterisk of a shape such as [*B, N] from beginning emphasis."""
-    lines[:] = [re.sub(r"(?<=[\[, ])\*(?=[A-Z,\]])(?![^`]*``)", r"\\*", line) for line in lines]
+    """Keep the asterisk of a shape such as [*B, N] from beginning emphasis, but for shapes in ``literals``."""
+    for index, line in enumerate(lines):
+        parts = line.split("``")
+        parts[::2] = [re.sub(r"(?<=[\[, ])\*(?=[A-Z,\]])", r"\\*", part) for part in parts[::2]]
+        lines[index] = "``".join(parts)
+
+
+def signature_of_init(app: Any, what: str, name: str, obj: Any, options: Any, given: str, returns: str) -> Any:
+    """Show how a class is made where a metaclass hides it behind ``(*args, **kwargs)``, as TensorDictModule's does."""
+    if what != "class" or given != "(*args, **kwargs)":
+        return None
+    own = inspect.signature(obj.__init__)
+    own = own.replace(parameters=list(own.parameters.values())[1:], return_annotation=inspect.Signature.empty)
+    return stringify_signature(own, show_annotation=False), returns

@@ -24,10 +24,11 @@ import yaml
 from omegaconf import MISSING
 
 import modgnn_rl
-from modgnn_rl.command import FLAGS, legal_values
+from modgnn_rl.command_help import FLAGS, legal_values
 
 PACKAGE = Path(modgnn_rl.__file__).parent
 CONFIGS = PACKAGE / "configs"
+ROOT = Path(__file__).parent.parent
 WORDS = {bool: "true or false", int: "whole number", float: "number", str: "text"}
 
 
@@ -74,7 +75,7 @@ def commands() -> list[Command]:
 def write_reference(folder: Path) -> None:
     """Write the pages into a folder, those that changed."""
     folder.mkdir(exist_ok=True)
-    for name, text in reference_pages().items():
+    for name, text in (reference_pages() | root_pages()).items():
         page = folder / name
         if not page.exists() or page.read_text(encoding="utf-8") != text:
             page.write_text(text, encoding="utf-8")
@@ -85,6 +86,16 @@ def reference_pages() -> dict[str, str]:
     known = commands()
     sections = _sections(known)
     return {"commands.md": _commands_page(known, sections), "settings.md": _settings_page(sections)}
+
+
+def root_pages() -> dict[str, str]:
+    """The README and the other pages at the top of the repository, for a folder two levels below it."""
+    pages = {}
+    for file in ROOT.glob("*.md"):
+        text = re.sub(r"\]\(docs/", "](../", file.read_text(encoding="utf-8"))
+        text = re.sub(r"\]\(([A-Z]+)\.md", lambda link: f"]({link[1].lower()}.md", text)
+        pages[f"{file.stem.lower()}.md"] = re.sub(r"\]\((?![a-z]+:|#|\.\./|[a-z]+\.md)", "](../../", text)
+    return pages
 
 
 def groups_of(command: Command) -> dict[str, str]:
@@ -151,8 +162,8 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 def _commands_page(known: list[Command], sections: list[Section]) -> str:
     """One part for each command: what it does, its choices, its settings."""
-    lines = ["# Commands", "", "Every command takes choices, settings and flags, in any order but for the flags, which"]
-    lines += ["stand together; `--help` shows them with the values that they have under the choices beside it.", ""]
+    lines = ["# Commands", "", "Every command takes choices and settings in any order, and flags before or after them."]
+    lines += ["`--help` shows all with the values that they have under the choices given beside it.", ""]
     lines += ["| command | |", "|---|---|"]
     lines += [f"| [`python -m modgnn_rl.{c.name}`](#{c.name}) | {_cell(_summary(c))} |" for c in known]
     for command in known:
@@ -172,7 +183,8 @@ def _commands_page(known: list[Command], sections: list[Section]) -> str:
             f"[{title}](settings.md#{_slug(title)})" for title in sorted(_title(s, sections) for s in here) if title
         ]
         lines += ["", f"Further settings: {', '.join(beyond)}."] if beyond else []
-    return "\n".join([*lines, "", "## Flags", "", "```text", FLAGS, "```", ""])
+    flags = [f"| `{flag}` | {_cell(text)} |" for flag, text in FLAGS.items()]
+    return "\n".join([*lines, "", "## Flags", "", "| flag | |", "|---|---|", *flags, ""])
 
 
 def _settings_page(sections: list[Section]) -> str:
@@ -183,7 +195,7 @@ def _settings_page(sections: list[Section]) -> str:
     for section in sorted((section for section in sections if section.prefix), key=lambda s: _title(s, sections)):
         title = _title(section, sections)
         used = ", ".join(f"[{name}](commands.md#{name})" for name in section.commands)
-        lines += [f"## {title}", "", inspect.cleandoc(section.kind.__doc__ or ""), "", f"*Of {used}.*", ""]
+        lines += [f"## {title}", "", inspect.cleandoc(section.kind.__doc__ or ""), "", f"*In {used}.*", ""]
         lines += _names(section) if _is_repeated(section, sections) else _table(section, f"{title}.")
         lines.append("")
     return "\n".join(lines)
@@ -217,7 +229,7 @@ def _names(section: Section) -> list[str]:
 def _table(section: Section, place: str) -> list[str]:
     """The settings of a section with their defaults, legal values, documentation and what choices set them to."""
     hints = typing.get_type_hints(section.kind)
-    lines = ["| setting | default | legal | what it does |", "|---|---|---|---|"]
+    lines = ["{.settings}", "| setting | default | legal | what it does |", "|---|---|---|---|"]
     for field in dataclasses.fields(section.kind):
         if "doc" not in field.metadata:
             continue
@@ -230,7 +242,7 @@ def _table(section: Section, place: str) -> list[str]:
         shown = "required" if default == MISSING else _shown(default)
         anchor = _slug(f"{place}{field.name}", "-")
         lines.append(f"| [`{name}`]{{#{anchor}}} | {shown} | {_legal(field, hints[field.name])} | {doc} |")
-    return lines if len(lines) > 2 else []
+    return lines if len(lines) > 3 else []
 
 
 def _legal(field: dataclasses.Field[Any], hint: Any) -> str:
