@@ -55,6 +55,7 @@ def commands() -> list[str]:
     found: dict[str, None] = {}
     for page in TEXTS:
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        text = re.sub(r"<!-- unfinished -->.*?<!-- finished -->", "", text, flags=re.DOTALL)
         code = re.findall(r"^```bash\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
         spans = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE))
         for line in [*(line for block in code for line in block.splitlines()), *spans]:
@@ -125,6 +126,8 @@ def compose(line: str, generate: ModuleType) -> None:
     name, *arguments = shlex.split(line)
     command = {command.name: command for command in generate.commands()}[name]
     flags = get_args_parser().parse_args(arguments)
+    if flags.shell_completion:
+        return
     overrides = {o.key_or_group: o for o in OverridesParser.create().parse_overrides(flags.overrides)}
     settings = OmegaConf.structured(command.schema)
     for group, default in generate.groups_of(command).items():
