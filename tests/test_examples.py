@@ -45,6 +45,7 @@ def test_own_f_com_finds_the_gains_of_the_expert_when_it_hears_everybody():
     assert near_cohesion > 0.1  # few pull for all
 
 
+@pytest.mark.slow
 def test_modgnn_learns_on_vmas():
     pytest.importorskip("vmas")
     module = example("modgnn_on_vmas")
@@ -97,6 +98,7 @@ def test_own_dagger_learns_with_each_gate_and_schedule(schedule, gate):
     assert errors[-1] < 0.8 * errors[0]
 
 
+@pytest.mark.slow
 def test_own_mappo_earns_more_of_its_own_reward(monkeypatch):
     module = example("own_mappo")
     monkeypatch.setattr(module, "WEIGHTS", {"effort": 1.0})  # what is felt at once is learned at once

@@ -103,6 +103,7 @@ def assert_flies_as_one_process(flights: RemoteFlights, **world) -> None:
             change(flown)
 
 
+@pytest.mark.slow
 def test_each_worker_flies_as_one_process_would_and_hears_of_changes(flights: RemoteFlights) -> None:
     assert_flies_as_one_process(flights)
 
