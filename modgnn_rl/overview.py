@@ -16,8 +16,8 @@ __all__ = ["commands", "completion", "overview"]
 HERE = Path(__file__).parent
 FIRST = {
     "train": "trainer.rounds=10 evaluation.num_flocks=10",
-    "runs": "",
     "replay": "'run=runs/<date>-<name>'",
+    "runs": "",
 }
 
 
@@ -53,7 +53,7 @@ def overview() -> str:
             for name, text in found.items()
         ),
         "",
-        "Try first: some minutes of training, which end with a table and the next command",
+        "Try first: some minutes of training, which end with a table and a flight to watch; then fly it anew, look at all runs",
         *(f"  python -m modgnn_rl.{name} {settings}".rstrip() for name, settings in FIRST.items()),
         "",
         "Every choice and every setting of a command",

@@ -4,8 +4,8 @@
     python docs/concepts/figures.py delayed-messages local-policies
     python docs/concepts/figures.py compounding-errors --cloned runs/<date>-<name> --dagger runs/<date>-<name>
 
-All of them take some minutes on one core; the two trainings of compounding-errors take most of it, unless the run
-folders of finished ones are given. Needs matplotlib (``pip install -e '.[plots]'``).
+All of them take half an hour on one core; the two trainings of compounding-errors take most of it, unless the run folders
+of finished ones are given. Needs matplotlib (``pip install -e '.[plots]'``).
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def trained(world: FlockingConfig, trainer: Any, finished: Path | None) -> ModGN
     with tempfile.TemporaryDirectory() as runs:
         config = TrainConfig(
             env=world,
-            model=ModelConfig(name="pair_force"),
+            model=ModelConfig(name="modgnn_mlp"),
             trainer=trainer,
             evaluation=EvaluationConfig(num_flocks=2, steps=4),
             runs=runs,
@@ -145,19 +145,18 @@ def trained(world: FlockingConfig, trainer: Any, finished: Path | None) -> ModGN
 
 
 def compounding_errors(cloned: Path | None = None, dagger: Path | None = None) -> Callable[[Figure], None]:
-    """Two policies of one model, cloned and trained by DAgger, on the expert's flights and on their own."""
-    world = FlockingConfig(num_agents=16)
-    small: Any = {"num_envs": 8, "batch_size": 64}
+    """Two policies of the paper's model, cloned and trained by DAgger, on the expert's flights and on their own."""
+    world = FlockingConfig()
     policies: dict[str, TensorDictModuleBase] = {
-        "cloned": trained(world, BCConfig(cloning_updates=2000, **small), cloned),
-        "DAgger": trained(world, DAggerConfig(cloning_updates=200, rounds=20, round_updates=20, **small), dagger),
+        "cloned": trained(world, BCConfig(), cloned),
+        "DAgger": trained(world, DAggerConfig(rounds=60), dagger),
         "expert, 1 hop": LocalReynolds.for_env(world, action=ACTION),
     }
     titles = {"on the expert's flights": True, "on flights of its own": False}
     panels = {}
     for title, flown_by_expert in titles.items():
         found = {
-            name: errors(policy, world, flocks=24, steps=800, flown_by_expert=flown_by_expert)[0]
+            name: errors(policy, world, flocks=40, steps=1000, flown_by_expert=flown_by_expert)[0]
             for name, policy in policies.items()
         }
         for name, values in found.items():
@@ -173,7 +172,6 @@ def compounding_errors(cloned: Path | None = None, dagger: Path | None = None) -
                 y_label="error, m²/s²",
                 references={"zero action": world.max_speed**2 / 3},
             )
-            panel.axes[0].set_ylim(0, 0.3)
 
     return onto
 
