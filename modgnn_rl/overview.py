@@ -53,7 +53,7 @@ def overview() -> str:
             for name, text in found.items()
         ),
         "",
-        "Try first: some minutes of training, which end with a table and a flight to watch; then fly it anew, look at all runs",
+        "Try first: some minutes of training, which end with a table and a flight to watch",
         *(f"  python -m modgnn_rl.{name} {settings}".rstrip() for name, settings in FIRST.items()),
         "",
         "Every choice and every setting of a command",

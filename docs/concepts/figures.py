@@ -4,8 +4,8 @@
     python docs/concepts/figures.py delayed-messages local-policies
     python docs/concepts/figures.py compounding-errors --cloned runs/<date>-<name> --dagger runs/<date>-<name>
 
-All of them take half an hour on one core; the two trainings of compounding-errors take most of it, unless the run folders
-of finished ones are given. Needs matplotlib (``pip install -e '.[plots]'``).
+All of them take half an hour on one core; the two trainings of compounding-errors take most of it, unless the run
+folders of finished ones are given. Needs matplotlib (``pip install -e '.[plots]'``).
 """
 
 from __future__ import annotations
