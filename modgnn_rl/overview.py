@@ -53,7 +53,7 @@ def overview() -> str:
             for name, text in found.items()
         ),
         "",
-        "Try first: some minutes of training, which end with a table and a flight to watch",
+        "Try first: a few minutes of training, which end with a table and a flight",
         *(f"  python -m modgnn_rl.{name} {settings}".rstrip() for name, settings in FIRST.items()),
         "",
         "Every choice and every setting of a command",
