@@ -63,13 +63,12 @@ def setup(app: Any) -> None:
 
 
 def mend_links(app: Any, name: str, source: list[str]) -> None:
-    """Lead links to the README and its like to their pages here, and drop patterns that match no page.
+    """Lead links to the README and its like to their pages here.
 
     Pages of results/ are no part of the site: they are offered as files.
     """
     text = re.sub(r"\]\((?:\.\./)+([A-Z]+)\.md", lambda link: f"](/reference/{link[1].lower()}.md", source[0])
-    text = re.sub(r"\]\((?=(?:\.\./)+results/[\w/-]+\.md\))", "](path:", text)
-    source[0] = re.sub(r"^([\w/-]+\*)\n", lambda line: line[0] if any(DOCS.glob(line[1])) else "", text, flags=re.M)
+    source[0] = re.sub(r"\]\((?=(?:\.\./)+results/[\w/-]+\.md\))", "](path:", text)
 
 
 def escape_shapes(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
