@@ -1,7 +1,8 @@
 """Large experiments in cells: pieces of work whose results are kept, so that the same command goes on where it ended.
 
-A cell is done when its file is there. One that fails does not stop the others, and is tried again next time. Processes
-that work in one folder share its cells: whoever holds a cell's lock does it.
+A cell is done when its file is there. What others need of it may be gone: it is made again where one of them is left to
+do. One that fails does not stop the others, and is tried again next time. Processes that work in one folder share its
+cells: whoever holds a cell's lock does it.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ WAIT = 1.0  # s between two looks at what other processes do
 TELLING = 0.03  # share of the work from which on the pace so far tells something
 
 
+def _always(result: Result) -> bool:
+    return True
+
+
 @dataclass(frozen=True)
 class Cell:
     """One piece of work.
@@ -38,12 +43,14 @@ class Cell:
         work: does it, given the results of the cells that it needs, by name; what it returns can be written as JSON.
         cost: how long it takes in comparison with others, for the time left.
         needs: names of cells that must be done before.
+        is_there: given its result, whether what it made beside that, and others need, is still there.
     """
 
     name: str
     work: Callable[[Mapping[str, Result]], Result]
     cost: float = 1.0
     needs: Sequence[str] = ()
+    is_there: Callable[[Result], bool] = _always
 
 
 @dataclass
@@ -80,7 +87,7 @@ def run_cells(folder: Path, cells: Sequence[Cell]) -> Outcome:
     """
     folder.mkdir(parents=True, exist_ok=True)
     outcome = Outcome()
-    pending = [cell for cell in cells if not _take(outcome, folder, cell)]
+    pending = _pending(outcome, folder, cells)
     clock = _Clock(cells, pending)
     while pending:
         moved = False
@@ -98,6 +105,23 @@ def run_cells(folder: Path, cells: Sequence[Cell]) -> Outcome:
     return outcome
 
 
+def _pending(outcome: Outcome, folder: Path, cells: Sequence[Cell]) -> list[Cell]:
+    """What nobody needs and is not done, and what that needs and is not there; of the others the results are taken."""
+    by_name = {cell.name: cell for cell in cells}
+    needed = {name for cell in cells for name in cell.needs}
+    left: set[str] = set()
+    asked_for = [cell for cell in cells if cell.name not in needed]
+    while asked_for:
+        cell = asked_for.pop()
+        if cell.name not in left and not _take(outcome, folder, cell):
+            left.add(cell.name)
+            asked_for += [by_name[name] for name in cell.needs]
+    for cell in cells:
+        if cell.name not in left:
+            _take(outcome, folder, cell, even_if_gone=True)
+    return [cell for cell in cells if cell.name in left]
+
+
 def _attempt(outcome: Outcome, folder: Path, cell: Cell, clock: _Clock) -> bool:
     """Do a cell unless it is done; false where another process is at it."""
     lock = FileLock(folder / f".{cell.name}.lock")
@@ -108,6 +132,7 @@ def _attempt(outcome: Outcome, folder: Path, cell: Cell, clock: _Clock) -> bool:
     try:
         if _take(outcome, folder, cell):
             return True
+        (folder / f"{cell.name}.json").unlink(missing_ok=True)  # what it tells of is gone
         print(f"{clock}: {cell.name}", file=sys.stderr, flush=True)
         begun = time.monotonic()
         result = cell.work({name: outcome.results[name] for name in cell.needs})
@@ -128,13 +153,16 @@ def _keep(folder: Path, cell: Cell, entry: Mapping[str, Any]) -> None:
     (folder / f"{cell.name}.failed.txt").unlink(missing_ok=True)
 
 
-def _take(outcome: Outcome, folder: Path, cell: Cell) -> bool:
-    """Read the result of a cell that is done; one whose file is damaged is not."""
+def _take(outcome: Outcome, folder: Path, cell: Cell, *, even_if_gone: bool = False) -> bool:
+    """Read the result of a cell that is done and there; one whose file is damaged is not."""
     try:
         entry = json.loads((folder / f"{cell.name}.json").read_text(encoding="utf-8"))
-        outcome.results[cell.name], outcome.seconds[cell.name] = dict(entry["result"]), float(entry["seconds"])
+        result, seconds = dict(entry["result"]), float(entry["seconds"])
+        if not even_if_gone and not cell.is_there(result):
+            return False
     except (OSError, ValueError, TypeError, KeyError):
         return False
+    outcome.results[cell.name], outcome.seconds[cell.name] = result, seconds
     return True
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -83,7 +83,12 @@ def _figures(flights: Flights) -> Result:
     for name, squares in flights.squares.items():
         figures[f"{name}_square"] = squares
         figures[f"{name}_spread"] = (squares - figures[name].square()).clamp(min=0).sqrt()
-    return {name: values.tolist() for name, values in figures.items()}
+    return {name: _rounded(values.tolist()) for name, values in figures.items()}
+
+
+def _rounded(values: Sequence[float]) -> list[float]:
+    """Six digits of each: results are kept for good, and much is flown."""
+    return [float(f"{value:.6g}") for value in values]
 
 
 def _held_out(config: ReproduceConfig, folder: Path, length: int) -> Iterator[TensorDict]:
@@ -101,7 +106,7 @@ def validate(config: ReproduceConfig, folder: Path, subject: Subject, done: Mapp
     errors = []
     for windows in _held_out(config, folder, policy.window):
         errors.append(float(imitation_loss(policy, windows, windows["agents", "controlled"][:, -1])))
-    return {"error": errors}
+    return {"error": _rounded(errors)}
 
 
 @torch.no_grad()
@@ -118,7 +123,7 @@ def look_on(config: ReproduceConfig, folder: Path, done: Mapping[str, Result]) -
             agents = policy(seen)["agents"]
             error = action_error(agents["action"], now["agents", "expert_action"], now["agents", "controlled"])
             errors[name].append(float(error.mean()))
-    return {name: {"error": values} for name, values in errors.items()}
+    return {name: {"error": _rounded(values)} for name, values in errors.items()}
 
 
 class Measurements:

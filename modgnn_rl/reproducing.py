@@ -33,7 +33,9 @@ __all__ = ["cells_of"]
 def cells_of(config: ReproduceConfig, study: Study, folder: Path) -> list[Cell]:
     """What a study takes: a dataset, trainings, flights of the references and of all policies in all worlds."""
     scale = config.scale
-    cells = [Cell("dataset", functools.partial(_collect, config, folder), cost=scale.episodes * scale.steps * 1e-4)]
+    cost = scale.episodes * scale.steps * 1e-4
+    is_there = functools.partial(_is_dataset_there, folder)
+    cells = [Cell("dataset", functools.partial(_collect, config, folder), cost, is_there=is_there)]
     flights = []
     for world in study.worlds:
         cost = 4 * _flight_cost(world)
@@ -99,7 +101,7 @@ def _cloning_cell(config: ReproduceConfig, study: Study, group: list[Subject], s
     )
     links = scale.batch_size * sum(subject.hops * (subject.layers or 1) for subject in group)
     cost = 3.0 + study.updates * (0.01 * len(group) + 3e-4 * links)  # seconds, roughly
-    return Cell(name, functools.partial(_train, training, group, folder), cost, ("dataset",))
+    return _training_cell(training, group, folder, cost, "dataset")
 
 
 def _stages_after(config: ReproduceConfig, study: Study, subject: Subject, seed: int, folder: Path) -> list[Cell]:
@@ -125,9 +127,18 @@ def _stages_after(config: ReproduceConfig, study: Study, subject: Subject, seed:
         name = _policy_cell(stage, study, subject, seed)
         need = _policy_cell(before, study, subject, seed)
         training = dataclasses.replace(_training(config, folder, name, seed), trainer=trainer)
-        cells.append(Cell(name, functools.partial(_train, training, [subject], folder), cost, (need,)))
+        cells.append(_training_cell(training, [subject], folder, cost, need))
         before = stage
     return cells
+
+
+def _training_cell(training: TrainConfig, group: Sequence[Subject], folder: Path, cost: float, need: str) -> Cell:
+    work = functools.partial(_train, training, group, folder)
+    return Cell(Path(training.runs).name, work, cost, (need,), functools.partial(_are_policies_there, folder))
+
+
+def _are_policies_there(folder: Path, result: Result) -> bool:
+    return all((folder / path).exists() for path in result["policies"].values())
 
 
 def _training(config: ReproduceConfig, folder: Path, name: str, seed: int) -> TrainConfig:
@@ -141,6 +152,10 @@ def _training(config: ReproduceConfig, folder: Path, name: str, seed: int) -> Tr
         runs=str(folder / "runs" / name),
         name="run",
     )
+
+
+def _is_dataset_there(folder: Path, result: Result) -> bool:
+    return (folder / "dataset").exists()
 
 
 def _collect(config: ReproduceConfig, folder: Path, done: Mapping[str, Result]) -> Result:

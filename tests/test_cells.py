@@ -38,6 +38,49 @@ def test_what_is_done_is_not_done_again(tmp_path):
     assert again.results == first.results
 
 
+def test_what_is_gone_is_made_again_where_something_left_needs_it(tmp_path):
+    calls = []
+
+    def making(name, needs=()):
+        def work(done):
+            calls.append(name)
+            (tmp_path / f"{name}.made").touch()
+            return {"value": name}
+
+        return Cell(name, work, needs=needs, is_there=lambda result: (tmp_path / f"{name}.made").exists())
+
+    work = [making("data"), making("policy", ("data",)), counting(calls, "flight", 1, ("policy",))]
+    first = run_cells(tmp_path, work)
+    for file in tmp_path.glob("*.made"):
+        file.unlink()
+    calls.clear()
+    again = run_cells(tmp_path, work)
+    assert calls == []
+    assert again.results == first.results
+    assert again.seconds == first.seconds
+    more = run_cells(tmp_path, [*work, counting(calls, "another", 2, ("policy",))])
+    assert calls == ["data", "policy", "another"]
+    assert more.results.keys() == {"data", "policy", "flight", "another"}
+
+
+def test_what_is_made_again_and_not_finished_is_not_done(tmp_path):
+    """Else half of it would pass for all of it."""
+    calls, made = [], tmp_path / "made"
+
+    def interrupted(done):
+        made.touch()
+        raise KeyboardInterrupt
+
+    def work(do):
+        return [Cell("a", do, is_there=lambda result: made.exists()), counting(calls, "b", 1, ("a",))]
+
+    (tmp_path / "a.json").write_text('{"seconds": 1.0, "result": {}}')
+    with pytest.raises(KeyboardInterrupt):
+        run_cells(tmp_path, work(interrupted))
+    run_cells(tmp_path, work(lambda done: calls.append("a") or {}))
+    assert calls == ["a", "b"]
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"result": 1}', '{"result": {}}'])
 def test_a_damaged_result_is_made_again(tmp_path, text):
     calls = []
