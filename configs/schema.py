@@ -549,6 +549,13 @@ class ReproduceConfig:
         "communication range, faults, or flock sizes, without training again where that is possible",
         choices=("tables", "communication", "layers", "range", "faults", "size"),
     )
+    models: Any = setting(
+        None,
+        "further models beside the paper's, your own too, a list: in the tables, and in range, faults and size; "
+        "null: none",
+        choices=MODEL_NAMES,
+    )
+    hops: Any = setting([1, 2, 3], "numbers of hops of these", low=0, whole=True)
     folder: str | None = setting(
         None, "where all goes; what is finished there is not made again; null: reproduction/<scale>"
     )

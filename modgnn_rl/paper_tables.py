@@ -16,7 +16,7 @@ from modgnn_rl.statistics import Interval, interquartile_interval
 from modgnn_rl.studies import Subject
 from modgnn_rl.tabular import Table
 
-__all__ = ["REFERENCES", "middle", "paper_tables", "published", "shown", "title_of"]
+__all__ = ["REFERENCES", "middle", "name_of", "paper_tables", "published", "shown", "title_of"]
 
 NAMES = {
     "modgnn_mlp": "ModGNN-MLP",
@@ -48,7 +48,12 @@ def title_of(row: Row) -> str:
     if row.model == "central":
         return NAMES[row.model]
     layers = "" if row.layers is None else f", L = {row.layers}"
-    return f"{NAMES[row.model]}{layers}, K = {row.hops}"
+    return f"{name_of(row.model)}{layers}, K = {row.hops}"
+
+
+def name_of(model: str) -> str:
+    """What a model is called in tables: as in the paper, or as in settings."""
+    return NAMES.get(model, model)
 
 
 def middle(measurements: Measurements, row: Row, world: str, figure: str) -> Interval | None:

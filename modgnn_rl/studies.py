@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig, ScaleConfig
+from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig, ScaleConfig, as_list
 from modgnn_rl.models import make_model
 
 __all__ = ["FAULTS", "HOPS", "Study", "Subject", "World", "equal_hidden", "fault_name", "study_of"]
@@ -80,6 +80,7 @@ def study_of(config: ReproduceConfig) -> Study:
     """The models and worlds of a study."""
     scale = config.scale
     every = [Subject(model, hops) for model in GNNS for hops in HOPS]
+    further = [Subject(model, hops) for model in as_list(config.models or []) for hops in as_list(config.hops)]
     usual = World("study-32", REFERENCE_SIZE, scale.study_flocks, scale.study_steps)
     if config.study == "communication":
         kinds = [Subject(model, hops) for model in KINDS for hops in (1, 2)]
@@ -93,9 +94,10 @@ def study_of(config: ReproduceConfig) -> Study:
         return Study("layers", shapes, [usual], scale.study_updates)
     if config.study == "tables":
         worlds = [World(f"N{size}", size, scale.flocks, scale.flight_steps) for size in scale.sizes]
-        return Study("tables", [*every, Subject("central", 1)], worlds, scale.updates)
+        subjects = dict.fromkeys([*every, Subject("central", 1), *further])
+        return Study("tables", list(subjects), worlds, scale.updates)
     worlds = {"range": _ranges, "faults": _faulty, "size": _sizes}[config.study](scale)
-    return Study("tables", every, worlds, scale.updates)
+    return Study("tables", list(dict.fromkeys([*every, *further])), worlds, scale.updates)
 
 
 def _ranges(scale: ScaleConfig) -> list[World]:

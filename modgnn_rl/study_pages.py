@@ -15,7 +15,7 @@ from modgnn_rl.claims import claim_tables
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig
 from modgnn_rl.files import write_atomically
 from modgnn_rl.measuring import VALIDATION, Measurements
-from modgnn_rl.paper_tables import NAMES, REFERENCES, middle, paper_tables, shown, title_of
+from modgnn_rl.paper_tables import REFERENCES, middle, name_of, paper_tables, shown, title_of
 from modgnn_rl.plots import Curve, Estimate, draw_curves, draw_intervals
 from modgnn_rl.report import Details, Figure, Section, gather_provenance, write_report
 from modgnn_rl.studies import FAULTS, HOPS, Subject, World, fault_name
@@ -102,7 +102,7 @@ def _by_hops(measurements: Measurements, world: str) -> Callable[[Canvas], None]
     for subject in measurements.study.subjects:
         layers = "" if subject.layers is None else f"L = {subject.layers}, "
         if (estimate := _estimate(measurements, subject, world)) is not None:
-            groups.setdefault(f"{layers}K = {subject.hops}", {})[NAMES[subject.model]] = estimate
+            groups.setdefault(f"{layers}K = {subject.hops}", {})[name_of(subject.model)] = estimate
     lines = {name: _estimate(measurements, name, world) for name in REFERENCES[2:]}
     references = {name: line.value for name, line in lines.items() if line is not None}
     return functools.partial(_draw_intervals, groups=groups, references=references)
@@ -245,8 +245,8 @@ def _curves_by_fault(measurements: Measurements) -> list[Figure]:
 
 def _curves(measurements: Measurements, hops: int, at: Sequence[tuple[float, str]]) -> dict[str, Curve]:
     """A curve for each model and two references, over levels with the names of their worlds."""
-    models = list(dict.fromkeys(subject.model for subject in measurements.study.subjects))
-    rows: dict[str, Subject | str] = {NAMES[model]: Subject(model, hops) for model in models}
+    subjects = [subject for subject in measurements.study.subjects if subject.hops == hops]
+    rows: dict[str, Subject | str] = {name_of(subject.model): subject for subject in subjects}
     rows |= {"LocalReynolds": "LocalReynolds(hops=1)", "zero action": "zero action"}
     curves, unknown = {}, Estimate(np.nan, np.nan, np.nan)
     for name, row in rows.items():

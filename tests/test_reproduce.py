@@ -15,11 +15,13 @@ from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig, ScaleConfi
 from modgnn_rl.errors import InputError
 from modgnn_rl.loading import load_policy
 from modgnn_rl.measuring import VALIDATION, Measurements
-from modgnn_rl.paper_tables import published
+from modgnn_rl.paper_tables import paper_tables, published
 from modgnn_rl.reproduce import claim_folder
 from modgnn_rl.reproducing import cells_of
+from modgnn_rl.settings import check
 from modgnn_rl.studies import Study, Subject, World, equal_hidden, study_of
 from modgnn_rl.study_pages import write_study
+from modgnn_rl.tabular import as_csv
 
 TINY = ScaleConfig(
     name="tiny", episodes=4, steps=30, held_out=2, updates=6, batch_size=4, flocks=2, flight_steps=8, sizes=[32],
@@ -107,6 +109,25 @@ def test_page_tables_and_report_are_written(reproduction):
     for name in ("Table 1", "Table 2", "Table 3", "What holds", "zero action", "Central", "0.267"):
         assert name in text
     assert {"table1.csv", "table1.tex", "table3.csv", "claims.tex"} <= {file.name for file in page.parent.iterdir()}
+
+
+def test_further_models_are_rows_beside_the_papers():
+    config = ReproduceConfig(scale=TINY, models=["gcn", "pair_force"], hops=[1, 4])
+    study = study_of(config)
+    further = [subject for subject in study.subjects if subject not in study_of(ReproduceConfig(scale=TINY)).subjects]
+    assert further == [Subject("gcn", 4), Subject("pair_force", 1), Subject("pair_force", 4)]
+    measured = Measurements(Outcome({}, {}, {}), config, study)
+    rows = [line.partition(",")[0] for line in as_csv(paper_tables(measured)["table1"]).splitlines()]
+    assert rows[-1] == '"pair_force'
+    assert set(further) < set(study_of(dataclasses.replace(config, study="range")).subjects)
+
+
+def test_without_further_models_nothing_needs_to_be_set():
+    check(ReproduceConfig())
+    assert len(study_of(ReproduceConfig()).subjects) == 16
+    one = ReproduceConfig(models="pair_force", hops=2)
+    check(one)
+    assert study_of(one).subjects[16:] == [Subject("pair_force", 2)]
 
 
 def test_failed_cells_are_said_in_the_tables(reproduction, tmp_path):
