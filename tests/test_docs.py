@@ -7,7 +7,7 @@ import importlib
 import re
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -32,11 +32,17 @@ KINDS = [kind for name in schema.__all__ if dataclasses.is_dataclass(kind := get
 
 
 @pytest.fixture(scope="module")
-def generate() -> Iterator[ModuleType]:
-    """The module docs/generate.py, as docs/conf.py imports it."""
+def scripts() -> Iterator[Callable[[str], ModuleType]]:
+    """The modules in docs/ by name."""
     sys.path.insert(0, str(DOCS))
-    yield importlib.import_module("generate")
+    yield importlib.import_module
     sys.path.remove(str(DOCS))
+
+
+@pytest.fixture(scope="module")
+def generate(scripts: Callable[[str], ModuleType]) -> ModuleType:
+    """The module docs/generate.py, as docs/conf.py imports it."""
+    return scripts("generate")
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +97,15 @@ def test_a_setting_shows_its_default_its_range_and_what_choices_make_of_it(refer
     assert row.endswith("<br>*`0.7` with `env=paper`* |")
     assert "`bc`" in row_of(reference["settings.md"], "trainer.name")
     assert "**`moment_force`**" in reference["commands.md"]
+
+
+def test_the_tables_of_results_are_those_of_the_files_in_results(scripts: Callable[[str], ModuleType]) -> None:
+    """Else: python docs/results_tables.py."""
+    tables = scripts("results_tables")
+    for page in tables.PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert "<!-- table" in text
+        assert tables.renewed(text) == text, page
 
 
 def test_every_command_is_on_the_page(reference: dict[str, str]) -> None:
