@@ -12,7 +12,7 @@ import json
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -134,9 +134,9 @@ def _attempt(outcome: Outcome, folder: Path, cell: Cell, clock: _Clock) -> bool:
             return True
         (folder / f"{cell.name}.json").unlink(missing_ok=True)  # what it tells of is gone
         print(f"{clock}: {cell.name}", file=sys.stderr, flush=True)
-        begun = time.monotonic()
-        result = cell.work({name: outcome.results[name] for name in cell.needs})
-        _keep(folder, cell, {"seconds": time.monotonic() - begun, "result": result})
+        with _timed(folder / f".{cell.name}.seconds") as watch:
+            result = cell.work({name: outcome.results[name] for name in cell.needs})
+        _keep(folder, cell, {"seconds": watch.seconds, "result": result})
         _take(outcome, folder, cell)
     except Exception as error:  # whatever it is, it must not stop the others
         outcome.failures[cell.name] = one_line(error)
@@ -146,6 +146,26 @@ def _attempt(outcome: Outcome, folder: Path, cell: Cell, clock: _Clock) -> bool:
     finally:
         lock.release()
     return True
+
+
+@dataclass
+class _Watch:
+    seconds: float
+
+
+@contextlib.contextmanager
+def _timed(file: Path) -> Iterator[_Watch]:
+    """Times work, together with what was spent on it before it was stopped, which the file tells."""
+    watch, begun = _Watch(0.0), time.monotonic()
+    with contextlib.suppress(OSError, ValueError):
+        watch.seconds = float(file.read_text(encoding="utf-8"))
+    try:
+        yield watch
+    except KeyboardInterrupt:
+        write_atomically(file, f"{watch.seconds + time.monotonic() - begun:.1f}\n")
+        raise
+    watch.seconds += time.monotonic() - begun
+    file.unlink(missing_ok=True)
 
 
 def _keep(folder: Path, cell: Cell, entry: Mapping[str, Any]) -> None:

@@ -124,6 +124,25 @@ def test_interruption_keeps_what_is_done(tmp_path):
     assert calls == ["a", "b"]
 
 
+def test_the_time_before_an_interruption_counts(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(cells.time, "monotonic", lambda: now[0])
+
+    def interrupted(done):
+        now[0] += 5.0
+        raise KeyboardInterrupt
+
+    def finished(done):
+        now[0] += 2.0
+        return {}
+
+    with pytest.raises(KeyboardInterrupt):
+        run_cells(tmp_path, [Cell("a", interrupted)])
+    assert run_cells(tmp_path, [Cell("a", finished)]).seconds["a"] == 7.0
+    (tmp_path / "a.json").unlink()
+    assert run_cells(tmp_path, [Cell("a", finished)]).seconds["a"] == 2.0
+
+
 def test_two_that_work_in_one_folder_share_the_cells(tmp_path, monkeypatch):
     monkeypatch.setattr(cells, "WAIT", 0.01)
     calls, busy = [], threading.Event()
