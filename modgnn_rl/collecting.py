@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import fcntl
 import json
 import math
@@ -26,7 +25,7 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.files import fsync_file, fsync_folder
-from modgnn_rl.manifest import FILES, Manifest, check_shard, describe_files, num_bytes
+from modgnn_rl.manifest import FILES, Manifest, check_shard, describe_files, num_bytes, recordable
 from modgnn_rl.progress import Progress
 from modgnn_rl.seeds import derive_seed
 from modgnn_rl.settings import check
@@ -36,8 +35,6 @@ __all__ = ["collect", "fly_expert", "report"]
 
 MARGIN = 2**24  # bytes that stay free on the disk
 LEFTOVER = re.compile(r"shard_\d{5,}\.tmp|\.manifest\.json\.\d+\.tmp")  # of a process that was killed
-# Faults that are seen only through adjacency, observation and mask, which a dataset does not hold.
-UNSEEN = ("message_loss", "delay", "range_spread", "position_noise", "velocity_noise", "dropout_rate")
 
 
 def collect(config: CollectConfig) -> Path:
@@ -55,7 +52,7 @@ def collect(config: CollectConfig) -> Path:
     check(config)
     prepare_torch(config.device, config.threads)
     wanted = Manifest(
-        world=_recordable(config.env, config.steps or config.env.max_steps),
+        world=recordable(config.env, config.steps or config.env.max_steps),
         seed=config.seed,
         num_envs=config.num_envs,
         steps=config.steps or config.env.max_steps,
@@ -74,25 +71,6 @@ def collect(config: CollectConfig) -> Path:
             f"cannot write into {folder} ({error.strerror}): give output=<a folder that you can write to>"
         ) from error
     return folder
-
-
-def _recordable(world: FlockingConfig, steps: int) -> FlockingConfig:
-    """The world of a dataset of flights of so many steps.
-
-    Raises:
-        InputError: a flock cannot be known from positions and velocities in this world.
-    """
-    if len(world.sizes) > 1:
-        raise InputError(f"env.num_agents={world.sizes} are several sizes; a dataset has one, collect one for each")
-    hidden = [f"env.{name}={getattr(world, name)}" for name in UNSEEN if getattr(world, name)]
-    if world.graph != "matrix":
-        hidden.append(f"env.graph={world.graph}")
-    if hidden:
-        raise InputError(
-            f"a dataset holds positions and velocities, which do not tell what agents see with {', '.join(hidden)}; "
-            "leave it out, or train with trainer=dagger, which collects its own flights"
-        )
-    return dataclasses.replace(world, num_agents=world.sizes[0], max_steps=steps)
 
 
 def _kept_shards(folder: Path, wanted: Manifest) -> dict[str, dict[str, Any]]:

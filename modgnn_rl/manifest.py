@@ -28,13 +28,25 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.files import sha256, write_atomically
 from modgnn_rl.settings import check
 
-__all__ = ["FILES", "MANIFEST", "SCHEMA_VERSION", "STATE", "Manifest", "check_shard", "describe_files", "num_bytes"]
+__all__ = [
+    "FILES",
+    "MANIFEST",
+    "SCHEMA_VERSION",
+    "STATE",
+    "Manifest",
+    "check_shard",
+    "describe_files",
+    "num_bytes",
+    "recordable",
+]
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 STATE = "state.memmap"
 FILES = ("meta.json", STATE)  # of a shard
 PACKAGES = ("modgnn_rl", "torch", "torchrl", "tensordict")
+# Faults that are seen only through adjacency, observation and mask, which a dataset does not hold.
+UNSEEN = ("message_loss", "delay", "range_spread", "position_noise", "velocity_noise", "dropout_rate")
 
 _DERIVED = ("schema_version", "complete", "num_agents")  # in the file for those who read it
 
@@ -203,3 +215,22 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
+
+
+def recordable(world: FlockingConfig, steps: int) -> FlockingConfig:
+    """The world of a dataset of flights of so many steps.
+
+    Raises:
+        InputError: a flock cannot be known from positions and velocities in this world.
+    """
+    if len(world.sizes) > 1:
+        raise InputError(f"env.num_agents={world.sizes} are several sizes; a dataset has one, collect one for each")
+    hidden = [f"env.{name}={getattr(world, name)}" for name in UNSEEN if getattr(world, name)]
+    if world.graph != "matrix":
+        hidden.append(f"env.graph={world.graph}")
+    if hidden:
+        raise InputError(
+            f"a dataset holds positions and velocities, which do not tell what agents see with {', '.join(hidden)}; "
+            "leave it out, or train with trainer=dagger, which collects its own flights"
+        )
+    return dataclasses.replace(world, num_agents=world.sizes[0], max_steps=steps)

@@ -14,6 +14,7 @@ from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.files import write_atomically
+from modgnn_rl.manifest import recordable
 from modgnn_rl.settings import flat
 
 
@@ -31,6 +32,7 @@ def main(config: ReproduceConfig) -> int:
             f"env.num_agents={config.env.num_agents} and scale.sizes={config.scale.sizes} must be and hold "
             f"{REFERENCE_SIZE}, the number of agents in the paper's training; other sizes are what scale.sizes is for"
         )
+    recordable(config.env, config.scale.steps)
     folder = claim_folder(config)
     from modgnn_rl.cells import run_cells
     from modgnn_rl.measuring import Measurements

@@ -16,7 +16,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.loading import load_policy
 from modgnn_rl.measuring import VALIDATION, Measurements
 from modgnn_rl.paper_tables import paper_tables, published
-from modgnn_rl.reproduce import claim_folder
+from modgnn_rl.reproduce import claim_folder, main
 from modgnn_rl.reproducing import cells_of
 from modgnn_rl.settings import check
 from modgnn_rl.studies import Study, Subject, World, equal_hidden, study_of
@@ -240,3 +240,11 @@ def test_a_folder_beside_the_user_is_meant_from_there(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert claim_folder(ReproduceConfig()) == tmp_path / "reproduction" / "small"
     assert claim_folder(ReproduceConfig(folder="mine")) == tmp_path / "mine"  # runs know themselves by absolute paths
+
+
+def test_a_world_that_no_dataset_can_hold_is_refused_before_anything_is_made(tmp_path):
+    folder = tmp_path / "one"
+    config = ReproduceConfig(folder=str(folder), env=FlockingConfig(position_noise=0.1))
+    with pytest.raises(InputError, match=r"env\.position_noise=0\.1"):
+        main(config)
+    assert not folder.exists()
