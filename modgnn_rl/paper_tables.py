@@ -16,7 +16,7 @@ from modgnn_rl.statistics import Interval, interquartile_interval
 from modgnn_rl.studies import Subject
 from modgnn_rl.tabular import Table
 
-__all__ = ["REFERENCES", "middle", "name_of", "paper_tables", "published", "shown", "title_of"]
+__all__ = ["REFERENCES", "middle", "name_of", "paper_tables", "published", "shown", "spread", "title_of"]
 
 NAMES = {
     "modgnn_mlp": "ModGNN-MLP",
@@ -149,12 +149,17 @@ def _evaluation(measurements: Measurements, rows: Sequence[Row]) -> Table:
     return Table("Table 2: flights of the models' own", [*header, "lost"], body, caption, best, REFERENCES)
 
 
-def _spread(measurements: Measurements, row: Row, figure: str) -> str:
-    """Mean ± standard deviation over time, agents, flights and seeds."""
+def spread(measurements: Measurements, row: Row, figure: str) -> tuple[float, float]:
+    """Mean and standard deviation of a figure over time, agents, flights and seeds; NaN where all failed."""
     values, squares = (measurements.values(row, "N32", name) for name in (figure, f"{figure}_square"))
     if values is None or squares is None:
-        return "failed"
-    return f"{values.mean():.2f} ± {math.sqrt(max(0.0, squares.mean() - values.mean() ** 2)):.2f}"
+        return math.nan, math.nan
+    return float(values.mean()), math.sqrt(max(0.0, squares.mean() - values.mean() ** 2))
+
+
+def _spread(measurements: Measurements, row: Row, figure: str) -> str:
+    mean, deviation = spread(measurements, row, figure)
+    return "failed" if math.isnan(mean) else f"{mean:.2f} ± {deviation:.2f}"
 
 
 def _share(measurements: Measurements, row: Row, figure: str) -> str:

@@ -83,7 +83,7 @@ def _yaml(config: ReproduceConfig) -> str:
 def _tabled(measurements: Measurements) -> tuple[dict[str, Table], list[Figure], str]:
     """The paper's tables and claims."""
     tables = {**claim_tables(measurements), **paper_tables(measurements)}
-    order = ("claims", "table1", "table2", "table2_middle", "table3", "comparisons")
+    order = ("claims", "margins", "table1", "table2", "table2_middle", "table3", "comparisons")
     figures = [
         Figure("validation_error", _by_hops(measurements, VALIDATION), "Error on the expert's flights, m²/s²."),
         Figure("error_in_flight", _by_hops(measurements, "N32"), "Error on flights of the models' own, m²/s²."),
