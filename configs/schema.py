@@ -521,7 +521,7 @@ class ScaleConfig:
     flight_steps: int = setting(1000, "steps of a flight", low=4)
     sizes: list[int] = setting([16, 32, 64], "numbers of agents that each policy is flown with (Table 3)", low=2)
     rounds: int = setting(40, "after=dagger or mappo: rounds of DAgger", low=1)
-    iterations: int = setting(15, "after=mappo: rounds of MAPPO", low=1)
+    iterations: int = setting(60, "after=mappo: rounds of MAPPO", low=1)
     num_envs: int = setting(16, "after=dagger or mappo: flocks flown at once", low=1)
     study_updates: int = setting(4000, "study=communication or layers: updates of each model", low=1)
     study_flocks: int = setting(16, "study=...: fresh flocks that each policy flies, of 32 agents or fewer", low=2)

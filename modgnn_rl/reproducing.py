@@ -116,7 +116,10 @@ def _stages_after(config: ReproduceConfig, study: Study, subject: Subject, seed:
         rotate=False,
     )
     mappo = MAPPOConfig(
-        iterations=scale.iterations, num_envs=scale.num_envs, critic_warmup=min(10, scale.iterations // 4)
+        iterations=scale.iterations,
+        num_envs=scale.num_envs,
+        critic_warmup=min(10, scale.iterations // 4),
+        anchor_rounds=min(50, scale.iterations // 2),
     )
     stages: list[tuple[str, DAggerConfig | MAPPOConfig, float]] = [
         ("dagger", dagger, 2.0 * scale.rounds),
