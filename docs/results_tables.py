@@ -34,31 +34,35 @@ def read(stage: str, table: str) -> Rows:
         return {next(iter(row.values())): row for row in csv.DictReader(lines)}
 
 
-def number(rows: Rows, name: str, column: str) -> str:
-    """A figure with three digits, or a dash where there is none."""
+def shown(rows: Rows, name: str, column: str) -> str:
+    """A number with three digits, text as it is, or a dash where there is neither."""
     text = rows.get(name, {}).get(column, "nan")
-    return "-" if text == "nan" else f"{float(text):.3f}"
+    try:
+        return "-" if text == "nan" else f"{float(text):.3f}"
+    except ValueError:
+        return text
 
 
 class Column(NamedTuple):
-    """An error, the paper's and ours: heading, name of the CSV files, columns in them."""
+    """A figure: heading, name of the CSV files, and in them the column of ours and, if any, the paper's."""
 
     heading: str
     table: str
-    paper: str
     ours: str
+    paper: str | None = None
 
 
-def errors(columns: Sequence[Column], only: Sequence[str] = ()) -> str:
-    """A row for each model, or for some only: each error as the paper has it and after all stages that were run."""
-    header, names = ["model"], dict.fromkeys(only or read("cloned", columns[0].table))
-    body = {name: [name] for name in names}
+def figures(columns: Sequence[Column], only: Sequence[str] = ()) -> str:
+    """A row for each model, or for some only: each figure as the paper has it and after all stages that were run."""
+    header = ["model"]
+    body = {name: [name] for name in only or read("cloned", columns[0].table)}
     for column in columns:
         stages = {stage: rows for stage in STAGES if (rows := read(stage, column.table))}
-        header += [f"{column.heading}: paper", *stages]
+        first, *others = [*(["paper"] if column.paper else []), *stages]
+        header += [f"{column.heading}: {first}", *others]
         for name, cells in body.items():
-            cells.append(number(stages["cloned"], name, column.paper))
-            cells += [number(rows, name, column.ours) for rows in stages.values()]
+            cells += [shown(stages["cloned"], name, column.paper)] if column.paper else []
+            cells += [shown(rows, name, column.ours) for rows in stages.values()]
     return markdown(header, list(body.values()))
 
 
@@ -82,13 +86,14 @@ def markdown(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|---" * len(header) + "|", *lines[1:]])
 
 
-VALIDATION = Column("validation", "table1", "paper", "mean")
-OWN_FLIGHTS = Column("own flights", "table2", "error, paper", "error")
+VALIDATION = Column("validation", "table1", "mean", "paper")
+OWN_FLIGHTS = Column("own flights", "table2", "error", "error, paper")
 TABLES: dict[str, Callable[[], str]] = {
-    "errors": lambda: errors([VALIDATION, OWN_FLIGHTS]),
-    "sizes": lambda: errors([Column(f"{n} agents", "table3", f"N = {n}, paper", f"N = {n}") for n in (16, 64)]),
+    "errors": lambda: figures([VALIDATION, OWN_FLIGHTS]),
+    "sizes": lambda: figures([Column(f"{n} agents", "table3", f"N = {n}", f"N = {n}, paper") for n in (16, 64)]),
+    "rewards": lambda: figures([Column("reward", "table2_middle", "reward"), Column("lost", "table2", "lost")]),
     "claims": claims,
-    "short": lambda: errors([VALIDATION, OWN_FLIGHTS], SHORT),
+    "short": lambda: figures([VALIDATION, OWN_FLIGHTS], SHORT),
 }
 
 
