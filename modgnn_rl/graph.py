@@ -12,6 +12,8 @@ import abc
 import torch
 from torch import Tensor
 
+from modgnn_rl.tensors import places_of
+
 __all__ = ["AGGREGATIONS", "Graph", "Links", "Pairs"]
 
 AGGREGATIONS = ("sum", "mean", "max")
@@ -136,17 +138,20 @@ class Links(Graph):
         """See `Graph.between`."""
         if senders.all() and receivers.all():
             return self
-        return self.only((senders[self.sender] & receivers[self.receiver]).nonzero().squeeze(-1))
+        # index_select takes a third of the time of indexing.
+        return self.only(places_of(senders.index_select(0, self.sender) & receivers.index_select(0, self.receiver)))
 
     def only(self, chosen: Tensor) -> Links:
         """The links of the given numbers, ascending [E']."""
-        attributes = {name: None if value is None else value[chosen] for name, value in self._of_links().items()}
+        taken = {
+            name: value if value is None else value.index_select(0, chosen) for name, value in self._of_links().items()
+        }
         return Links(
-            self.sender[chosen],
-            self.receiver[chosen],
+            self.sender.index_select(0, chosen),
+            self.receiver.index_select(0, chosen),
             self.num_senders,
             self.num_receivers,
-            **attributes,
+            **taken,
         )
 
     def _of_links(self) -> dict[str, Tensor | None]:

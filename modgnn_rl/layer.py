@@ -14,7 +14,7 @@ from modgnn_rl.aggregation import Hop, Tables, aggregate, call, suited_form
 from modgnn_rl.communication import GraphShift, Laplacian
 from modgnn_rl.errors import InputError
 from modgnn_rl.graph import AGGREGATIONS, Graph
-from modgnn_rl.tensors import keep_rows, stack_padded
+from modgnn_rl.tensors import keep_rows, places_of, stack_padded
 from modgnn_rl.topology import Topology
 
 __all__ = ["STARTS", "ModGNNLayer", "Recorder", "only_finite"]
@@ -261,7 +261,7 @@ def _call_for(who: Tensor | None, topology: Topology, module: nn.Module, data: T
         return call(module, data, own)
     if topology.as_pairs or who.all():
         return keep_rows(call(module, data, own), who)
-    rows = who.nonzero().squeeze(-1)
+    rows = places_of(who)
     result = call(module, _take(data, rows), {key: _take(value, rows) for key, value in own.items()})
     return result.new_zeros(len(data), *result.shape[1:]).index_copy(0, rows, result)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -15,6 +16,7 @@ __all__ = [
     "pair_blocks",
     "pair_differences",
     "pair_distances",
+    "places_of",
     "squared_norm",
     "stack_padded",
 ]
@@ -26,6 +28,13 @@ PAIRS_IN_BLOCK_ELSEWHERE = 2**24
 def is_transformed() -> bool:
     """Whether a compiler or a transform of ``torch.func`` is at work, under which shapes must not depend on data."""
     return torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None
+
+
+def places_of(mask: Tensor) -> Tensor:
+    """Where a mask [E] is true, ascending, int64; on a CPU by NumPy, in a tenth of the time that torch takes."""
+    if mask.device.type == "cpu" and not is_transformed():
+        return torch.from_numpy(np.flatnonzero(mask.numpy()))
+    return mask.nonzero().squeeze(-1)
 
 
 def keep_rows(value: Tensor, rows: Tensor, other: float = 0.0) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from modgnn_rl.errors import InputError
 from modgnn_rl.graph import Graph, Links, Pairs
-from modgnn_rl.tensors import is_transformed
+from modgnn_rl.tensors import is_transformed, places_of
 
 __all__ = ["FORMS", "Topology"]
 
@@ -108,12 +108,12 @@ class Topology:
         else:
             self.wanted_nodes = wanted & self.exists
         # Numbers of the wanted nodes, as long as shapes may depend on data.
-        self.rows = None if self.as_pairs or self.wanted_nodes is None else self.wanted_nodes.nonzero().squeeze(-1)
+        self.rows = None if self.as_pairs or self.wanted_nodes is None else places_of(self.wanted_nodes)
         self._wanted = None
 
     def exists_rows(self) -> Tensor | None:
         """Numbers of the nodes that exist; None: all."""
-        return None if self.exists is None else self.exists.nonzero().squeeze(-1)
+        return None if self.exists is None else places_of(self.exists)
 
     def _suits_pairs(self, *, some: bool) -> bool:
         if is_transformed():
@@ -133,10 +133,14 @@ class Topology:
             sender, receiver, position = self._listed_links(rows)
         else:
             linked = self.adjacency.reshape(nodes, size).bool()
-            receiver, sender = (linked if rows is None else linked[rows]).nonzero().unbind(-1)
-            receiver = receiver if rows is None else rows[receiver]
-            position = receiver * size + sender
-            sender = sender + receiver.div(size, rounding_mode="floor") * size
+            linked = linked if rows is None else linked.index_select(0, rows)
+            position = places_of(linked.flatten())
+            receiver = position.div(size, rounding_mode="floor")
+            sender = position - receiver * size
+            if rows is not None:
+                receiver = rows.index_select(0, receiver)
+                position = receiver * size + sender
+            sender = sender + (receiver - receiver % size)
         if self.exists is not None:
             there = self.exists[sender]
             sender, receiver, position = sender[there], receiver[there], position[there]
@@ -167,7 +171,7 @@ class Topology:
             chosen = torch.zeros(self.num_nodes, dtype=torch.bool, device=rows.device)
             chosen[rows] = True
             valid = valid & chosen[receiver.clamp(min=0)]
-        position = valid.nonzero().squeeze(-1)
+        position = places_of(valid)
         position = position[receiver[position].argsort(stable=True)]
         return sender[position], receiver[position], position
 
