@@ -55,7 +55,8 @@ class Column(NamedTuple):
 def figures(columns: Sequence[Column], only: Sequence[str] = ()) -> str:
     """A row for each model, or for some only: each figure as the paper has it and after all stages that were run."""
     header = ["model"]
-    body = {name: [name] for name in only or read("cloned", columns[0].table)}
+    everywhere = dict.fromkeys(name for stage in STAGES for name in read(stage, columns[0].table))
+    body = {name: [name] for name in only or everywhere}
     for column in columns:
         stages = {stage: rows for stage in STAGES if (rows := read(stage, column.table))}
         first, *others = [*(["paper"] if column.paper else []), *stages]
