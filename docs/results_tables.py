@@ -20,7 +20,7 @@ STAGES = {"cloned": "tables", "DAgger": "tables-after-dagger", "MAPPO": "tables-
 SHORT = (
     *("ModGNN-MLP, K = 1", "ModGNN-MLP, K = 2", "ModGNN-MLP, K = 3", "ModGNN-MLP [-f_mid], K = 1"),
     *("ModGNN-MLP [-f_pre], K = 1", "GCN [+f_final], K = 1", "GCN, K = 1", "Central"),
-    *("LocalReynolds(hops=1)", "zero action"),
+    *("moment_force, K = 1", "pair_force, K = 1", "LocalReynolds(hops=1)", "zero action"),
 )
 Rows = dict[str, dict[str, str]]
 
