@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from modgnn_rl.text_tables import markdown
+
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "docs" / "results.md", ROOT / "README.md")
 RESULTS = ROOT / "results" / "small"
@@ -64,14 +66,14 @@ def figures(columns: Sequence[Column], only: Sequence[str] = ()) -> str:
         for name, cells in body.items():
             cells += [shown(stages["cloned"], name, column.paper)] if column.paper else []
             cells += [shown(rows, name, column.ours) for rows in stages.values()]
-    return markdown(header, list(body.values()))
+    return markdown([header, *body.values()])
 
 
 def claims() -> str:
     """A row for each ordering of the paper's: whether it holds, and how many of its comparisons do."""
     stages = {stage: rows for stage in STAGES if (rows := read(stage, "claims"))}
     body = [[name, *(verdict(rows[name]) for rows in stages.values())] for name in stages["cloned"]]
-    return markdown(["the paper says", *stages], body)
+    return markdown([["the paper says", *stages], *body])
 
 
 def verdict(row: Mapping[str, str]) -> str:
@@ -79,12 +81,6 @@ def verdict(row: Mapping[str, str]) -> str:
     word = "**holds**" if row["here"] == "holds" else row["here"]
     away = f", {row['reversed']} reversed" if row["reversed"] != "0" else ""
     return f"{word} ({row['comparisons that hold']}{away})"
-
-
-def markdown(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [f"| {' | '.join(cells)} |" for cells in (header, *body)]
-    return "\n".join([lines[0], "|---" * len(header) + "|", *lines[1:]])
 
 
 VALIDATION = Column("validation", "table1", "mean", "paper")

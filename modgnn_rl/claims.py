@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modgnn_rl.measuring import VALIDATION, Measurements
-from modgnn_rl.paper_tables import NAMES, published, shown, spread
+from modgnn_rl.paper_tables import NAMES, mean, published, shown, spread
 from modgnn_rl.statistics import Interval, probability_of_improvement
 from modgnn_rl.studies import HOPS, Subject
 from modgnn_rl.tabular import Table
@@ -199,29 +199,26 @@ def claim_tables(measurements: Measurements) -> dict[str, Table]:
 def _margins(measurements: Measurements) -> Table:
     """By how much ModGNN-MLP is better than the better of the two baselines, there and here."""
     paper = published()["model_evaluation"]
-    header, body = ["K"], []
+    body = []
     for hop in HOPS:
-        there = {name: paper[name][hop] for name in ("modgnn_mlp", *BASELINES)}
-        here = {name: Subject(name, hop) for name in there}
-        errors = {name: measurements.values(row, "N32", "error") for name, row in here.items()}
-        means = {name: np.nan if values is None else float(values.mean()) for name, values in errors.items()}
-        spreads = {name: spread(measurements, row, "separation")[1] for name, row in here.items()}
-        both = (
-            ({name: entry["error"] for name, entry in there.items()}, means),
-            ({name: entry["separation"][1] for name, entry in there.items()}, spreads),
+        models = ("modgnn_mlp", *BASELINES)
+        there, here = [paper[model][hop] for model in models], [Subject(model, hop) for model in models]
+        errors = [entry["error"] for entry in there], [mean(measurements, row, "N32", "error") for row in here]
+        spreads = (
+            [entry["separation"][1] for entry in there],
+            [spread(measurements, row, "separation")[1] for row in here],
         )
-        body.append([str(hop), *(_less(figures) for pair in both for figures in pair)])
-    for name in ("error", "spread of separation"):
-        header += [f"{name}, paper", name]
+        body.append([str(hop), *map(_less, (*errors, *spreads))])
     caption = (
         "Error on own flights, and standard deviation of the separation over time, agents and flights (Table 2): how "
         "far that of ModGNN-MLP lies below the lower one of GCN and GCN [+f_final]."
     )
+    header = ["K", "error, paper", "error", "spread of separation, paper", "spread of separation"]
     return Table("By how much ModGNN-MLP is better than the best baseline", header, body, caption)
 
 
-def _less(figures: dict[str, float]) -> str:
+def _less(figures: Sequence[float]) -> str:
     """How much lower the first figure is than the lowest of the others."""
-    own, *others = figures.values()
+    own, *others = figures
     share = 1 - own / min(others)
     return "not measured" if np.isnan(share) else f"{abs(share):.0%} {'lower' if share >= 0 else 'higher'}"

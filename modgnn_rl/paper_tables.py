@@ -16,7 +16,7 @@ from modgnn_rl.statistics import Interval, interquartile_interval
 from modgnn_rl.studies import Subject
 from modgnn_rl.tabular import Table
 
-__all__ = ["REFERENCES", "middle", "name_of", "paper_tables", "published", "shown", "spread", "title_of"]
+__all__ = ["REFERENCES", "mean", "middle", "name_of", "paper_tables", "published", "shown", "spread", "title_of"]
 
 NAMES = {
     "modgnn_mlp": "ModGNN-MLP",
@@ -81,7 +81,8 @@ def paper_tables(measurements: Measurements) -> dict[str, Table]:
     }
 
 
-def _mean(measurements: Measurements, row: Row, world: str, figure: str) -> float:
+def mean(measurements: Measurements, row: Row, world: str, figure: str) -> float:
+    """Mean of a figure over seeds and flights; NaN where all failed."""
     values = measurements.values(row, world, figure)
     return math.nan if values is None else float(values.mean())
 
@@ -117,8 +118,8 @@ def _validation(measurements: Measurements, rows: Sequence[Row]) -> Table:
         model, hops = _hops(row)
         paper = _paper(row, "validation_loss", model, hops)
         here = middle(measurements, row, VALIDATION, "error")
-        mean = _mean(measurements, row, VALIDATION, "error")
-        body.append([title_of(row), math.nan if paper is None else paper, mean, shown(here)])
+        average = mean(measurements, row, VALIDATION, "error")
+        body.append([title_of(row), math.nan if paper is None else paper, average, shown(here)])
     caption = (
         "Mean squared error against the expert's action, per component, m²/s², while the expert flies. Middle: "
         f"interquartile mean with its 95 % interval over seeds and flights. {_about(measurements, VALIDATION)}"
@@ -135,7 +136,7 @@ def _evaluation(measurements: Measurements, rows: Sequence[Row]) -> Table:
     for row in rows:
         model, hops = _hops(row)
         paper = _paper(row, "model_evaluation", model, hops) or {}
-        cells: list[Any] = [title_of(row), paper.get("error", math.nan), _mean(measurements, row, "N32", "error")]
+        cells: list[Any] = [title_of(row), paper.get("error", math.nan), mean(measurements, row, "N32", "error")]
         for figure in METRES:
             there = paper.get(figure)
             cells += ["-" if there is None else f"{there[0]:.2f} ± {there[1]:.2f}", _spread(measurements, row, figure)]
@@ -196,9 +197,9 @@ def _generalization(measurements: Measurements, rows: Sequence[Row]) -> Table:
         cells: list[Any] = [title_of(row)]
         for world in worlds:
             paper = _paper(row, "generalization", model, hops, world.num_agents)
-            mean = _mean(measurements, row, world.name, "error")
+            average = mean(measurements, row, world.name, "error")
             here = middle(measurements, row, world.name, "error")
-            cells += [math.nan if paper is None else paper, mean, shown(here)]
+            cells += [math.nan if paper is None else paper, average, shown(here)]
         body.append(cells)
     caption = (
         "Error on flights of the models' own with other numbers of agents than the 32 of training: mean, and "
