@@ -13,7 +13,7 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from modgnn_rl.settings import setting
+from modgnn_rl.configs.settings import setting
 
 __all__ = [
     "REFERENCE_SIZE",

@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase, MarlGroupMapType
 
 from modgnn_rl.compiling import compiled
 from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, as_list
+from modgnn_rl.configs.settings import check, suggestion
 from modgnn_rl.envs.faults import Faults
 from modgnn_rl.envs.leader import make_leader
 from modgnn_rl.envs.nonfinite import complaint, lost_flocks, unusable
@@ -24,7 +25,6 @@ from modgnn_rl.envs.snapshots import refuse_foreign
 from modgnn_rl.envs.starts import start_positions
 from modgnn_rl.errors import InputError
 from modgnn_rl.seeds import derive_seed
-from modgnn_rl.settings import check, suggestion
 from modgnn_rl.tensors import clip_to_ball
 
 __all__ = ["FlockingEnv", "checked_config"]

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.configs.settings import suggestion
 from modgnn_rl.envs.flocking import FlockingEnv
 from modgnn_rl.envs.rendering import RENDER_MODES, Flock, Renderer, check_render_mode, has_display
 from modgnn_rl.errors import InputError
 from modgnn_rl.seeds import derive_seed
-from modgnn_rl.settings import suggestion
 
 __all__ = ["Flocks", "GymnasiumFlocking", "GymnasiumFlocks", "as_array"]
 

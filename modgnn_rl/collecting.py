@@ -20,6 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
+from modgnn_rl.configs.settings import check
 from modgnn_rl.dataset import WITHOUT_EFFECT
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
@@ -28,7 +29,6 @@ from modgnn_rl.files import fsync_file, fsync_folder
 from modgnn_rl.manifest import FILES, Manifest, check_shard, describe_files, num_bytes, recordable
 from modgnn_rl.progress import Progress
 from modgnn_rl.seeds import derive_seed
-from modgnn_rl.settings import check
 from modgnn_rl.training import prepare_torch
 
 __all__ = ["collect", "fly_expert", "report"]

@@ -50,10 +50,10 @@ from omegaconf.errors import (
 )
 
 from modgnn_rl.command_help import children, fields, help_text
+from modgnn_rl.configs.settings import check, suggestion
 from modgnn_rl.errors import InputError
 from modgnn_rl.interruption import Stopped
 from modgnn_rl.overview import completion
-from modgnn_rl.settings import check, suggestion
 
 __all__ = ["run_command", "settings_given"]
 
@@ -81,7 +81,7 @@ def run_command(
 
     Args:
         main: the command; its docstring heads the help, its return value is the exit code (``None`` counts as 0).
-        schema: dataclass of the whole configuration, declared with `modgnn_rl.settings.setting`.
+        schema: dataclass of the whole configuration, declared with `modgnn_rl.configs.settings.setting`.
         name: name of the command and of its YAML file.
         nodes: dataclasses of single choices, by ``"group/choice"``.
         config_path: where Hydra looks for the YAML files.

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from torchrl.record import CSVLogger, TensorboardLogger, WandbLogger
 
 from modgnn_rl.configs.schema import WandbConfig
+from modgnn_rl.configs.settings import flat
 from modgnn_rl.errors import one_line
 from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.settings import flat
 
 __all__ = ["CsvFiles", "Dashboard", "Tensorboard", "Wandb"]
 

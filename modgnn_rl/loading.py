@@ -12,11 +12,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
+from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.models import configured_model
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.settings import check
 
 __all__ = ["changed_world", "load_policy", "stored_model", "stored_world"]
 

@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any
 
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.files import sha256, write_atomically
-from modgnn_rl.settings import check
 
 __all__ = [
     "FILES",

@@ -20,10 +20,10 @@ from torchrl.modules import recurrent_mode
 
 from modgnn_rl.aggregation import suited_form
 from modgnn_rl.cache import AgentCache
+from modgnn_rl.configs.settings import suggestion
 from modgnn_rl.errors import InputError
 from modgnn_rl.graph import Graph
 from modgnn_rl.layer import ModGNNLayer
-from modgnn_rl.settings import suggestion
 from modgnn_rl.tensors import is_transformed, keep_rows
 from modgnn_rl.topology import FORMS, Topology
 

@@ -19,6 +19,7 @@ from tensordict.nn import TensorDictModuleBase
 from modgnn_rl import distributed
 from modgnn_rl.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
+from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation import evaluate
 from modgnn_rl.interruption import Interruption
@@ -29,7 +30,6 @@ from modgnn_rl.recording import Recorder, spacing
 from modgnn_rl.replay_page import write_replay
 from modgnn_rl.resuming import begins_anew, changed_config, differences, stored_config
 from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.settings import check
 from modgnn_rl.table import as_markdown, read_tables, summarise_flights
 from modgnn_rl.trainers.bc import bc
 from modgnn_rl.trainers.callbacks import Callback

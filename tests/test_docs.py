@@ -21,8 +21,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from modgnn_rl.configs import schema
+from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
-from modgnn_rl.settings import check
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"

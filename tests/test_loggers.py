@@ -21,11 +21,11 @@ import torch
 
 from modgnn_rl import training
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig, WandbConfig
+from modgnn_rl.configs.settings import check
 from modgnn_rl.dashboards import Dashboard
 from modgnn_rl.errors import InputError
 from modgnn_rl.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.settings import check
 from modgnn_rl.trainers.callbacks import Callback
 
 

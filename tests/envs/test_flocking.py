@@ -16,13 +16,13 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 from modgnn_rl import configs
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.configs.settings import check
 from modgnn_rl.envs import FlockingEnv, TorchPhysics
 from modgnn_rl.envs.leader import NoiseLeader
 from modgnn_rl.envs.rewards import flocking_costs, flocking_reward, reward_weights
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import LocalReynolds, Reynolds, as_matrix
 from modgnn_rl.models import make_model
-from modgnn_rl.settings import check
 from modgnn_rl.tensors import pair_distances
 
 NAN = math.nan
