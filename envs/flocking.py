@@ -12,7 +12,6 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, MarlGroupMapType
 
-from modgnn_rl.compiling import compiled
 from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, as_list
 from modgnn_rl.configs.settings import check, suggestion
 from modgnn_rl.envs.faults import Faults
@@ -24,8 +23,9 @@ from modgnn_rl.envs.rewards import LIMITS, judge, reward_weights
 from modgnn_rl.envs.snapshots import refuse_foreign
 from modgnn_rl.envs.starts import start_positions
 from modgnn_rl.errors import InputError
-from modgnn_rl.seeds import derive_seed
-from modgnn_rl.tensors import clip_to_ball
+from modgnn_rl.utils.compile import compiled
+from modgnn_rl.utils.seeds import derive_seed
+from modgnn_rl.utils.tensors import clip_to_ball
 
 __all__ = ["FlockingEnv", "checked_config"]
 

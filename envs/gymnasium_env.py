@@ -23,7 +23,7 @@ from modgnn_rl.configs.settings import suggestion
 from modgnn_rl.envs.flocking import FlockingEnv
 from modgnn_rl.envs.rendering import RENDER_MODES, Flock, Renderer, check_render_mode, has_display
 from modgnn_rl.errors import InputError
-from modgnn_rl.seeds import derive_seed
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["Flocks", "GymnasiumFlocking", "GymnasiumFlocks", "as_array"]
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.snapshots import Stateful
-from modgnn_rl.tensors import clip_to_ball
+from modgnn_rl.utils.tensors import clip_to_ball
 
 __all__ = ["CircleLeader", "Leader", "NoiseLeader", "WaypointLeader", "make_leader"]
 

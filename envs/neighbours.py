@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.tensors import PAIRS_IN_BLOCK, PAIRS_IN_BLOCK_ELSEWHERE, pair_blocks, pair_differences, squared_norm
+from modgnn_rl.utils.tensors import (
+    PAIRS_IN_BLOCK,
+    PAIRS_IN_BLOCK_ELSEWHERE,
+    pair_blocks,
+    pair_differences,
+    squared_norm,
+)
 
 __all__ = ["link_list", "near_pairs"]
 
@@ -22,7 +28,7 @@ def near_pairs(position: Tensor, radius: float) -> tuple[Tensor, Tensor, Tensor,
 
     Where flocks are large and wide, agents are sorted into cells of the width of the radius, and compared with those of
     neighbouring cells; elsewhere all pairs are compared, in blocks. Both give the same, bit for bit: the pairs whose
-    `modgnn_rl.tensors.pair_distances` are at most the radius.
+    `modgnn_rl.utils.tensors.pair_distances` are at most the radius.
 
     Args:
         position: m [B, N, 3]; agents whose position is not finite are near nobody.

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from modgnn_rl.compiling import compiled
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.controller import Rotors, mix_rotors, rotor_wrench, velocity_controller
 from modgnn_rl.envs.quadcopter import Dynamics
 from modgnn_rl.envs.rigid_body import Bodies, rotor_drag, step_bodies
 from modgnn_rl.envs.vectors import Components, Vector, add, rotation_matrix, to_body_frame
 from modgnn_rl.errors import InputError
+from modgnn_rl.utils.compile import compiled
 
 __all__ = ["Flight", "Physics", "TorchPhysics", "fly", "make_physics"]
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from modgnn_rl.envs.faults import Faults
 from modgnn_rl.envs.neighbours import link_list, near_pairs
-from modgnn_rl.tensors import pair_distances
+from modgnn_rl.utils.tensors import pair_distances
 
 __all__ = ["hear_all_pairs", "hear_near_pairs"]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.metrics import is_diverged
-from modgnn_rl.tensors import squared_norm
+from modgnn_rl.utils.tensors import squared_norm
 
 __all__ = ["COSTS", "LIMITS", "flocking_costs", "flocking_reward", "judge", "reward_weights"]
 

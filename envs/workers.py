@@ -21,7 +21,7 @@ from torchrl.envs import ParallelEnv
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking import FlockingEnv, checked_config
 from modgnn_rl.errors import InputError
-from modgnn_rl.seeds import derive_seed
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["ParallelFlocks", "make_flocks", "parallel_flocks"]
 

@@ -18,7 +18,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.graph import Pairs
 from modgnn_rl.layer import ModGNNLayer, only_finite
 from modgnn_rl.modgnn import ModGNN
-from modgnn_rl.tensors import keep_rows
+from modgnn_rl.utils.tensors import keep_rows
 
 __all__ = ["Agent", "LinkData", "check_local", "link_data", "no_messages", "own_data", "step"]
 

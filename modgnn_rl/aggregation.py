@@ -25,7 +25,7 @@ from torch.nn.modules.batchnorm import _NormBase
 from modgnn_rl import relu_links
 from modgnn_rl.communication import Communication
 from modgnn_rl.graph import Graph, Links
-from modgnn_rl.tensors import is_transformed
+from modgnn_rl.utils.tensors import is_transformed
 
 __all__ = ["Hop", "aggregate", "call", "suited_form"]
 

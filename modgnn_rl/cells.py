@@ -20,8 +20,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from modgnn_rl.errors import one_line
-from modgnn_rl.files import write_atomically
-from modgnn_rl.text_tables import as_span
+from modgnn_rl.utils.files import write_atomically
+from modgnn_rl.utils.text import as_span
 
 __all__ = ["Cell", "Outcome", "run_cells"]
 

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from modgnn_rl.aggregation import Tables
 from modgnn_rl.errors import InputError
 from modgnn_rl.layer import Recorder, only_finite
-from modgnn_rl.tensors import keep_rows
 from modgnn_rl.topology import Topology
+from modgnn_rl.utils.tensors import keep_rows
 
 __all__ = ["CentralLayer"]
 

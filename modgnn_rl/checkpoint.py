@@ -30,7 +30,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.files import fsync_file, fsync_folder, sha256
+from modgnn_rl.utils.files import fsync_file, fsync_folder, sha256
 
 __all__ = ["SCHEMA_VERSION", "Checkpoint", "has_checkpoint", "load_checkpoint", "save_checkpoint"]
 

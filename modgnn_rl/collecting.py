@@ -25,11 +25,11 @@ from modgnn_rl.dataset import WITHOUT_EFFECT
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import Reynolds
-from modgnn_rl.files import fsync_file, fsync_folder
 from modgnn_rl.manifest import FILES, Manifest, check_shard, describe_files, num_bytes, recordable
-from modgnn_rl.progress import Progress
-from modgnn_rl.seeds import derive_seed
 from modgnn_rl.training import prepare_torch
+from modgnn_rl.utils.files import fsync_file, fsync_folder
+from modgnn_rl.utils.progress import Progress
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["collect", "fly_expert", "report"]
 

@@ -52,8 +52,8 @@ from omegaconf.errors import (
 from modgnn_rl.command_help import children, fields, help_text
 from modgnn_rl.configs.settings import check, suggestion
 from modgnn_rl.errors import InputError
-from modgnn_rl.interruption import Stopped
 from modgnn_rl.overview import completion
+from modgnn_rl.utils.signals import Stopped
 
 __all__ = ["run_command", "settings_given"]
 

@@ -27,7 +27,7 @@ from modgnn_rl.configs.schema import FlockingConfig, as_list
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.manifest import MANIFEST, STATE, Manifest, check_shard
-from modgnn_rl.tensors import pair_distances
+from modgnn_rl.utils.tensors import pair_distances
 
 __all__ = ["WITHOUT_EFFECT", "FlightDataset", "FlightWindows"]
 

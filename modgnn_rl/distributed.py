@@ -21,7 +21,7 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.seeds import derive_seed
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = [
     "any_of",

@@ -26,7 +26,7 @@ from modgnn_rl.metrics import (
     separation,
     smallest_distance,
 )
-from modgnn_rl.progress import Progress
+from modgnn_rl.utils.progress import Progress
 
 __all__ = ["Flights", "endless_env", "evaluate", "fly", "reference_policies"]
 

@@ -16,12 +16,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from modgnn_rl.cache import AgentCache, missing
-from modgnn_rl.compiling import compiled
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.graph import Graph, Pairs
-from modgnn_rl.tensors import clip_to_ball, is_transformed, pair_blocks, pair_differences, squared_norm
 from modgnn_rl.topology import Topology
+from modgnn_rl.utils.compile import compiled
+from modgnn_rl.utils.tensors import clip_to_ball, is_transformed, pair_blocks, pair_differences, squared_norm
 
 __all__ = ["LocalReynolds", "Reynolds", "as_matrix", "reachable", "reynolds"]
 

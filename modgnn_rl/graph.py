@@ -12,7 +12,7 @@ import abc
 import torch
 from torch import Tensor
 
-from modgnn_rl.tensors import places_of
+from modgnn_rl.utils.tensors import places_of
 
 __all__ = ["AGGREGATIONS", "Graph", "Links", "Pairs"]
 

@@ -14,8 +14,8 @@ from modgnn_rl.aggregation import Hop, Tables, aggregate, call, suited_form
 from modgnn_rl.communication import GraphShift, Laplacian
 from modgnn_rl.errors import InputError
 from modgnn_rl.graph import AGGREGATIONS, Graph
-from modgnn_rl.tensors import keep_rows, places_of, stack_padded
 from modgnn_rl.topology import Topology
+from modgnn_rl.utils.tensors import keep_rows, places_of, stack_padded
 
 __all__ = ["STARTS", "ModGNNLayer", "Recorder", "only_finite"]
 

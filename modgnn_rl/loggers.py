@@ -16,8 +16,8 @@ import torch
 from modgnn_rl.configs.schema import TrainConfig, as_list
 from modgnn_rl.dashboards import CsvFiles, Dashboard, Tensorboard, Wandb
 from modgnn_rl.errors import InputError, one_line
-from modgnn_rl.provenance import made_with
 from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.utils.provenance import made_with
 
 __all__ = ["Dashboards", "check_logger", "make_logger"]
 

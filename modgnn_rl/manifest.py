@@ -26,7 +26,7 @@ from typing import Any
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
-from modgnn_rl.files import sha256, write_atomically
+from modgnn_rl.utils.files import sha256, write_atomically
 
 __all__ = [
     "FILES",

@@ -20,10 +20,10 @@ from modgnn_rl.experts import LocalReynolds
 from modgnn_rl.loading import load_policy
 from modgnn_rl.metrics import action_error
 from modgnn_rl.modgnn import ModGNN
-from modgnn_rl.progress import Progress
-from modgnn_rl.seeds import derive_seed
 from modgnn_rl.studies import Study, Subject, World
 from modgnn_rl.trainers.imitation import imitation_loss
+from modgnn_rl.utils.progress import Progress
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["VALIDATION", "Measurements", "flight_cell", "fly_references", "fly_subject", "look_on", "validate"]
 

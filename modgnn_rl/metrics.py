@@ -14,7 +14,7 @@ from torch import Tensor
 
 from modgnn_rl.errors import InputError
 from modgnn_rl.spheres import smallest_enclosing_sphere
-from modgnn_rl.tensors import pair_blocks, pair_differences, squared_norm
+from modgnn_rl.utils.tensors import pair_blocks, pair_differences, squared_norm
 
 __all__ = [
     "action_error",

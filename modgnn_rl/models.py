@@ -26,8 +26,8 @@ from modgnn_rl.configs.settings import suggestion
 from modgnn_rl.equivariant import VELOCITY_SCALE, Moments, PairForce, VectorSquash, mlp
 from modgnn_rl.errors import InputError
 from modgnn_rl.modgnn import ModGNN, ModGNNLayer
-from modgnn_rl.seeds import seeded
-from modgnn_rl.tensors import clip_to_ball
+from modgnn_rl.utils.seeds import seeded
+from modgnn_rl.utils.tensors import clip_to_ball
 
 __all__ = [
     "MODELS",

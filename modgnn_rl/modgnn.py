@@ -24,8 +24,8 @@ from modgnn_rl.configs.settings import suggestion
 from modgnn_rl.errors import InputError
 from modgnn_rl.graph import Graph
 from modgnn_rl.layer import ModGNNLayer
-from modgnn_rl.tensors import is_transformed, keep_rows
 from modgnn_rl.topology import FORMS, Topology
+from modgnn_rl.utils.tensors import is_transformed, keep_rows
 
 __all__ = ["ModGNN", "ModGNNLayer"]
 

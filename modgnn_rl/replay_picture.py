@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modgnn_rl.files import write_atomically
 from modgnn_rl.recording import QUANTUM, Recording
+from modgnn_rl.utils.files import write_atomically
 
 __all__ = ["write_picture"]
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from modgnn_rl.drawing import Drawing, can_draw, draw, page_colours
 from modgnn_rl.errors import InputError
-from modgnn_rl.files import write_atomically
-from modgnn_rl.provenance import Provenance, gather_provenance
 from modgnn_rl.tabular import Table, numeric_columns, slug
+from modgnn_rl.utils.files import write_atomically
+from modgnn_rl.utils.provenance import Provenance, gather_provenance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -23,9 +23,9 @@ from modgnn_rl.configs.schema import (
 )
 from modgnn_rl.measuring import VALIDATION, flight_cell, fly_references, fly_subject, look_on, validate
 from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.seeds import derive_seed
 from modgnn_rl.studies import Study, Subject, World
 from modgnn_rl.training import resume, train
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["cells_of"]
 

@@ -24,7 +24,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.files import fsync_file, write_atomically
+from modgnn_rl.utils.files import fsync_file, write_atomically
 
 __all__ = ["SCHEMA_VERSION", "RunFolder"]
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from datetime import datetime
 
 from modgnn_rl.run_summary import METRICS, RunSummary
-from modgnn_rl.text_tables import aligned, as_figure, as_span, markdown, printable
+from modgnn_rl.utils.text import aligned, as_figure, as_span, markdown, printable
 
 __all__ = ["list_runs", "next_steps", "sort_key", "state_of"]
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.text_tables import markdown
+from modgnn_rl.utils.text import markdown
 
 __all__ = ["Table", "as_csv", "as_latex", "as_markdown"]
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from modgnn_rl.errors import InputError
 from modgnn_rl.graph import Graph, Links, Pairs
-from modgnn_rl.tensors import is_transformed, places_of
+from modgnn_rl.utils.tensors import is_transformed, places_of
 
 __all__ = ["FORMS", "Topology"]
 

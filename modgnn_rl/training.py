@@ -22,7 +22,6 @@ from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingC
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation import evaluate
-from modgnn_rl.interruption import Interruption
 from modgnn_rl.loading import changed_world, load_policy
 from modgnn_rl.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.modgnn import ModGNN
@@ -38,6 +37,7 @@ from modgnn_rl.trainers.mappo import mappo
 from modgnn_rl.trainers.session import Session
 from modgnn_rl.trainers.setup import check_training, settle_model
 from modgnn_rl.trainers.watching import Watch, log_evaluation
+from modgnn_rl.utils.signals import Interruption
 
 __all__ = ["TRAINERS", "evaluate_policies", "evaluate_run", "prepare_torch", "resume", "train"]
 
@@ -50,7 +50,7 @@ def train(
 ) -> RunFolder:
     """Train a policy, evaluate it, and leave everything in a new run folder.
 
-    Ctrl-C and SIGTERM let the round end, write a checkpoint and raise `modgnn_rl.interruption.Stopped`; `resume` goes
+    Ctrl-C and SIGTERM let the round end, write a checkpoint and raise `modgnn_rl.utils.signals.Stopped`; `resume` goes
     on from there, or from the last checkpoint before whatever else ended the run. In processes that ``torchrun`` has
     started, all train together; the first alone writes into the folder and evaluates.
 

@@ -17,8 +17,8 @@ import pytest
 from modgnn_rl.command import run_command, settings_given
 from modgnn_rl.configs.settings import setting
 from modgnn_rl.errors import InputError
-from modgnn_rl.interruption import Stopped
 from modgnn_rl.overview import completion
+from modgnn_rl.utils.signals import Stopped
 
 ROOT = Path(__file__).parent.parent
 

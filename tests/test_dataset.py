@@ -26,7 +26,7 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import Reynolds
 from modgnn_rl.manifest import MANIFEST, STATE
-from modgnn_rl.seeds import derive_seed
+from modgnn_rl.utils.seeds import derive_seed
 
 WORLD = FlockingConfig(num_agents=6, comm_range=2.0, separation_gain=0.7, leader_max_speed=float("inf"))
 EPISODES, STEPS, AT_ONCE = 5, 9, 2

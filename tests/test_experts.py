@@ -16,7 +16,7 @@ from torch import Tensor
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import LocalReynolds, Reynolds, as_matrix, reachable, reynolds
-from modgnn_rl.tensors import PAIRS_IN_BLOCK
+from modgnn_rl.utils.tensors import PAIRS_IN_BLOCK
 
 GAINS: dict[str, Any] = {"cohesion": 0.06, "separation": 0.8, "alignment": 0.02}
 FREE: dict[str, Any] = {**GAINS, "max_speed": 1e9}

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from modgnn_rl import metrics, tensors
+from modgnn_rl import metrics
 from modgnn_rl.errors import InputError
+from modgnn_rl.utils import tensors
 
 NAN, INF = math.nan, math.inf
 

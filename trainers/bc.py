@@ -18,12 +18,12 @@ from modgnn_rl.dataset import FlightDataset
 from modgnn_rl.evaluation import fly
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.collection import Flocks, flocks_of_all_sizes, named_flocks, validation_flocks
 from modgnn_rl.trainers.journal import Journal
 from modgnn_rl.trainers.learner import Learner, fit_together, validate_together
 from modgnn_rl.trainers.session import Session
 from modgnn_rl.trainers.setup import DART_PARTS, make_learner, side_by_side
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["bc"]
 

@@ -16,11 +16,11 @@ from modgnn_rl.configs.schema import REFERENCE_SIZE, CollectorConfig, FlockingCo
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.equivariant import is_equivariant
 from modgnn_rl.modgnn import ModGNN
-from modgnn_rl.seeds import derive_seed, seeded
 from modgnn_rl.trainers.imitation import are_alike
 from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture, SafetyGate, spread
 from modgnn_rl.trainers.remote import RemoteFlights
 from modgnn_rl.trainers.saving import Part, Tensors
+from modgnn_rl.utils.seeds import derive_seed, seeded
 
 __all__ = [
     "FlockCollector",

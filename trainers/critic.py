@@ -9,7 +9,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from modgnn_rl.equivariant import mlp
-from modgnn_rl.tensors import pair_distances
+from modgnn_rl.utils.tensors import pair_distances
 
 __all__ = ["FlockCritic", "PooledCritic", "flock_features"]
 

@@ -19,14 +19,14 @@ from modgnn_rl import distributed
 from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.configs.schema import TrainerConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.interruption import Stopped
 from modgnn_rl.modgnn import ModGNN
-from modgnn_rl.progress import Progress
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.collection import FlockCollector, Flocks
 from modgnn_rl.trainers.remote import RemoteFlights
 from modgnn_rl.trainers.saving import Part, gather, scatter
 from modgnn_rl.trainers.session import Session
+from modgnn_rl.utils.progress import Progress
+from modgnn_rl.utils.signals import Stopped
 
 __all__ = ["Journal", "Learns"]
 
@@ -127,7 +127,7 @@ class Journal:
             last: number of its last.
 
         Raises:
-            modgnn_rl.interruption.Stopped: after the round in which a signal came, and after its checkpoint.
+            modgnn_rl.utils.signals.Stopped: after the round in which a signal came, and after its checkpoint.
         """
         interruption = self.session.interruption
         advice = "Stopping after this round, with a checkpoint; once more stops at once, without one."

@@ -18,7 +18,6 @@ from modgnn_rl import distributed
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ImitationConfig
 from modgnn_rl.equivariant import is_equivariant
 from modgnn_rl.modgnn import ModGNN
-from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.imitation import (
     are_alike,
     hide_velocities,
@@ -30,6 +29,7 @@ from modgnn_rl.trainers.imitation import (
 )
 from modgnn_rl.trainers.saving import Tensors
 from modgnn_rl.trainers.stepping import Stepper
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["Learner", "cosine_learning_rate", "fit_together", "moments_of", "restore_moments", "validate_together"]
 

@@ -16,7 +16,7 @@ from modgnn_rl.metrics import (
     separation,
     smallest_distance,
 )
-from modgnn_rl.tensors import pair_distances
+from modgnn_rl.utils.tensors import pair_distances
 
 __all__ = ["flight_metrics", "reward_metrics"]
 

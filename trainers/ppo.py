@@ -16,7 +16,6 @@ from torchrl.objectives import MAPPOLoss, ValueEstimators
 from modgnn_rl import distributed
 from modgnn_rl.configs.schema import REFERENCE_SIZE, MAPPOConfig
 from modgnn_rl.modgnn import ModGNN
-from modgnn_rl.seeds import derive_seed, seeded
 from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.collection import as_windows
 from modgnn_rl.trainers.critic import FlockCritic
@@ -24,6 +23,7 @@ from modgnn_rl.trainers.imitation import random_receivers
 from modgnn_rl.trainers.learner import moments_of, restore_moments
 from modgnn_rl.trainers.saving import Tensors
 from modgnn_rl.trainers.stepping import Stepper
+from modgnn_rl.utils.seeds import derive_seed, seeded
 
 __all__ = ["AnchoredMAPPOLoss", "Improver", "improvement_window"]
 

@@ -19,10 +19,10 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.saving import Tensors
 from modgnn_rl.trainers.worker_side import Flight, packed, weights_of
 from modgnn_rl.trainers.workers import ProcessWorker, RayWorker, Worker, WorkerEndedError, close_all
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["RemoteFlights", "check_collector"]
 

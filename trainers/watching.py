@@ -16,8 +16,8 @@ from modgnn_rl.evaluation import Flights, fly, reference_policies
 from modgnn_rl.loggers import Dashboards
 from modgnn_rl.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.seeds import derive_seed, seeded
 from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.utils.seeds import derive_seed, seeded
 from modgnn_rl.videos import check_video, film, write_video
 
 __all__ = ["Watch", "log_evaluation"]

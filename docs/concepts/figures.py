@@ -31,8 +31,8 @@ from modgnn_rl.evaluation import endless_env
 from modgnn_rl.experts import LocalReynolds, Reynolds
 from modgnn_rl.metrics import action_error, is_lost
 from modgnn_rl.plots import Curve, draw_curves, draw_panels
-from modgnn_rl.seeds import seeded
 from modgnn_rl.training import train
+from modgnn_rl.utils.seeds import seeded
 
 HERE = Path(__file__).parent
 BIN = 20  # steps of a flight that make one point of a curve

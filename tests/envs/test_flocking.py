@@ -23,7 +23,7 @@ from modgnn_rl.envs.rewards import flocking_costs, flocking_reward, reward_weigh
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import LocalReynolds, Reynolds, as_matrix
 from modgnn_rl.models import make_model
-from modgnn_rl.tensors import pair_distances
+from modgnn_rl.utils.tensors import pair_distances
 
 NAN = math.nan
 ACTION = ("agents", "action")

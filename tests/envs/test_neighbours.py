@@ -13,7 +13,7 @@ from torch import Tensor
 from modgnn_rl.envs import neighbours
 from modgnn_rl.envs.neighbours import link_list, near_pairs
 from modgnn_rl.errors import InputError
-from modgnn_rl.tensors import PAIRS_IN_BLOCK, pair_distances
+from modgnn_rl.utils.tensors import PAIRS_IN_BLOCK, pair_distances
 
 WAYS = ("blocks", "cells")
 seeds = st.integers(0, 999)

@@ -19,7 +19,7 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.nonfinite import unusable
 from modgnn_rl.errors import InputError, NotFinite
 from modgnn_rl.experts import Reynolds
-from modgnn_rl.tensors import pair_distances
+from modgnn_rl.utils.tensors import pair_distances
 
 NAN, INF = math.nan, math.inf
 FLOCK, AGENT, STEP = 1, 2, 3  # what goes wrong where and when

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.rewards import COSTS, flocking_costs, flocking_reward, reward_weights
-from modgnn_rl.tensors import pair_distances
+from modgnn_rl.utils.tensors import pair_distances
 
 DISTANCES: Any = {"crowding_distance": 0.9, "collision_distance": 0.5}
 

@@ -19,7 +19,7 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.workers import ParallelFlocks, parallel_flocks
 from modgnn_rl.errors import InputError
 from modgnn_rl.models import make_model
-from modgnn_rl.seeds import derive_seed
+from modgnn_rl.utils.seeds import derive_seed
 
 WORKERS, FLOCKS, AGENTS = 2, 2, 3
 SCRIPT = """

@@ -25,7 +25,6 @@ from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
 from modgnn_rl.errors import InputError, NotFinite
 from modgnn_rl.experts import Reynolds
-from modgnn_rl.interruption import Stopped
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.callbacks import Callback
@@ -34,6 +33,7 @@ from modgnn_rl.trainers.imitation import imitation_loss, random_receivers
 from modgnn_rl.trainers.learner import Learner
 from modgnn_rl.trainers.ppo import Improver
 from modgnn_rl.training import resume, train
+from modgnn_rl.utils.signals import Stopped
 
 WORLD = FlockingConfig(num_agents=4, max_steps=15)
 SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}

@@ -22,12 +22,12 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import Reynolds
-from modgnn_rl.seeds import derive_seed
 from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.collection import FlockCollector
 from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture
 from modgnn_rl.trainers.remote import RemoteFlights, check_collector
 from modgnn_rl.trainers.worker_side import packed
+from modgnn_rl.utils.seeds import derive_seed
 
 SEED, AGENTS, STEPS = 3, 4, 4
 SHARES = (2, 1)  # flocks of each worker

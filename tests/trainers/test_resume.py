@@ -21,10 +21,10 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
 )
 from modgnn_rl.errors import InputError
-from modgnn_rl.interruption import Stopped
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.training import resume, train
+from modgnn_rl.utils.signals import Stopped
 
 SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}
 MAPPO: Any = {"num_envs": 2, "iterations": 5, "round_steps": 14, "critic_warmup": 1, "epochs": 1, "batches": 2}

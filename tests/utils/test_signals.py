@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from modgnn_rl.interruption import Interruption, Stopped
+from modgnn_rl.utils.signals import Interruption, Stopped
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
@@ -74,7 +74,7 @@ def test_another_thread_listens_to_nothing():
 def test_the_second_ends_the_process_whatever_it_does(number):
     program = f"""
 import os, time
-from modgnn_rl.interruption import Interruption
+from modgnn_rl.utils.signals import Interruption
 with Interruption().listen() as interruption:
     with interruption.deferred("Stopping soon."):
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from modgnn_rl.seeds import derive_seed
+from modgnn_rl.utils.seeds import derive_seed
 
 
 def test_seeds_differ_between_roles_and_runs_and_stay_the_same():

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from modgnn_rl.progress import Progress
+from modgnn_rl.utils.progress import Progress
 
 
 class Terminal(io.StringIO):

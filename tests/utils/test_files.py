@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from modgnn_rl import files
+from modgnn_rl.utils import files
 
 
 @pytest.mark.parametrize(("data", "expected"), [("é\n", "é\n".encode()), (b"\x00\xff", b"\x00\xff"), ("", b"")])

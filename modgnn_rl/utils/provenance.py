@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from modgnn_rl.text_tables import as_span
+from modgnn_rl.utils.text import as_span
 
 __all__ = ["Provenance", "gather_provenance", "made_with"]
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from modgnn_rl import tensors
-from modgnn_rl.tensors import clip_to_ball, pair_blocks, pair_differences, pair_distances, squared_norm
+from modgnn_rl.utils import tensors
+from modgnn_rl.utils.tensors import clip_to_ball, pair_blocks, pair_differences, pair_distances, squared_norm
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from modgnn_rl.compiling import compiled
+from modgnn_rl.utils.compile import compiled
 
 COMPILER = shutil.which("g++") or shutil.which("clang++")
 

@@ -9,13 +9,13 @@ import sys
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from modgnn_rl.provenance import gather_provenance, made_with
+from modgnn_rl.utils.provenance import gather_provenance, made_with
 
 
 def test_what_a_run_was_made_with():
     about = made_with()
     assert about["torchrl"] == importlib.metadata.version("torchrl")
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     git = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
     if git.returncode == 0:
         assert about["commit"].removesuffix("-dirty") == git.stdout.strip()

@@ -1,0 +1,1 @@
+"""Small helpers that know nothing of policies or environments: tensors, seeds, files, progress, signals."""
