@@ -31,9 +31,10 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
-from modgnn_rl import ModGNN, ModGNNLayer, aggregation, graph
+from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.equivariant import mlp
 from modgnn_rl.models import LATENT
+from modgnn_rl.nn import aggregation, graph
 
 HIDDEN, INPUTS, OUTPUTS = 32, 6, 3
 SHAPES = ((256, 32), (1, 1024))

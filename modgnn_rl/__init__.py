@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from modgnn_rl.agent import Agent
     from modgnn_rl.loading import load_policy
     from modgnn_rl.models import make_model, register_model
-    from modgnn_rl.modgnn import ModGNN, ModGNNLayer
+    from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
 
 __version__ = "0.1.0"
 __all__ = ["Agent", "ModGNN", "ModGNNLayer", "__version__", "load_policy", "make_model", "register_model"]
 
 _HOMES = {
     "Agent": "modgnn_rl.agent",
-    "ModGNN": "modgnn_rl.modgnn",
-    "ModGNNLayer": "modgnn_rl.modgnn",
+    "ModGNN": "modgnn_rl.nn.modgnn",
+    "ModGNNLayer": "modgnn_rl.nn.modgnn",
     "load_policy": "modgnn_rl.loading",
     "make_model": "modgnn_rl.models",
     "register_model": "modgnn_rl.models",

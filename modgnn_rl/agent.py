@@ -13,11 +13,11 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from modgnn_rl.aggregation import Hop, Tables, aggregate, call
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import Pairs
-from modgnn_rl.layer import ModGNNLayer, only_finite
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.aggregation import Hop, Tables, aggregate, call
+from modgnn_rl.nn.graph import Pairs
+from modgnn_rl.nn.layer import ModGNNLayer, only_finite
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.utils.tensors import keep_rows
 
 __all__ = ["Agent", "LinkData", "check_local", "link_data", "no_messages", "own_data", "step"]

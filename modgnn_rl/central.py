@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from modgnn_rl.aggregation import Tables
 from modgnn_rl.errors import InputError
-from modgnn_rl.layer import Recorder, only_finite
-from modgnn_rl.topology import Topology
+from modgnn_rl.nn.aggregation import Tables
+from modgnn_rl.nn.layer import Recorder, only_finite
+from modgnn_rl.nn.topology import Topology
 from modgnn_rl.utils.tensors import keep_rows
 
 __all__ = ["CentralLayer"]

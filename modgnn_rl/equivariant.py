@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from modgnn_rl.communication import GraphShift
+from modgnn_rl.nn.communication import GraphShift
 
 __all__ = ["Moments", "PairForce", "VectorSquash", "is_equivariant", "mlp"]
 

@@ -15,11 +15,11 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from modgnn_rl.cache import AgentCache, missing
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import Graph, Pairs
-from modgnn_rl.topology import Topology
+from modgnn_rl.nn.graph import Graph, Pairs
+from modgnn_rl.nn.primer import AgentCache, missing
+from modgnn_rl.nn.topology import Topology
 from modgnn_rl.utils.compile import compiled
 from modgnn_rl.utils.tensors import clip_to_ball, is_transformed, pair_blocks, pair_differences, squared_norm
 
@@ -115,7 +115,7 @@ def _pair_forces(offset: Sequence[Tensor], drift: Sequence[Tensor], gains: tuple
 
 
 def as_matrix(adjacency: Tensor, num_agents: int) -> Tensor:
-    """A graph as a bool matrix [..., N, N], from any form that `modgnn_rl.topology.Topology` reads."""
+    """A graph as a bool matrix [..., N, N], from any form that `modgnn_rl.nn.topology.Topology` reads."""
     graph = Topology(adjacency, num_agents, form="pairs").everyone()
     assert isinstance(graph, Pairs)
     return graph.mask.view(*adjacency.shape[:-2], num_agents, num_agents)

@@ -13,7 +13,7 @@ from modgnn_rl.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from modgnn_rl.exporting import Exported
-    from modgnn_rl.modgnn import ModGNN
+    from modgnn_rl.nn.modgnn import ModGNN
 
 NEIGHBOURS = 10  # whose messages come in while the latency is measured
 REPEATS = 300

@@ -15,7 +15,7 @@ from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.models import configured_model
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 
 __all__ = ["changed_world", "load_policy", "stored_model", "stored_world"]

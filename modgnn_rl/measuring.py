@@ -19,7 +19,7 @@ from modgnn_rl.evaluation import Flights, fly, reference_policies
 from modgnn_rl.experts import LocalReynolds
 from modgnn_rl.loading import load_policy
 from modgnn_rl.metrics import action_error
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.studies import Study, Subject, World
 from modgnn_rl.trainers.imitation import imitation_loss
 from modgnn_rl.utils.progress import Progress

@@ -24,7 +24,7 @@ from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation import evaluate
 from modgnn_rl.loading import changed_world, load_policy
 from modgnn_rl.loggers import Dashboards, check_logger, make_logger
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.recording import Recorder, spacing
 from modgnn_rl.replay_page import write_replay
 from modgnn_rl.resuming import begins_anew, changed_config, differences, stored_config

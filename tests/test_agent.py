@@ -15,7 +15,9 @@ from torch import Tensor, nn
 
 from modgnn_rl import Agent, ModGNN, ModGNNLayer, make_model
 from modgnn_rl.agent import LinkData, step
-from modgnn_rl.communication import (
+from modgnn_rl.errors import InputError
+from modgnn_rl.models import MODELS
+from modgnn_rl.nn.communication import (
     Adjacency,
     CoordinateFrame,
     GraphAttention,
@@ -23,9 +25,7 @@ from modgnn_rl.communication import (
     MessagePassing,
     NormalizedAdjacency,
 )
-from modgnn_rl.errors import InputError
-from modgnn_rl.graph import AGGREGATIONS
-from modgnn_rl.models import MODELS
+from modgnn_rl.nn.graph import AGGREGATIONS
 
 AGENTS, FEATURES, WIDTH, LINK_FEATURES, STEPS = 4, 6, 4, 2, 6
 LOCAL_STARTS = ("mask", "zero")

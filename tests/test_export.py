@@ -26,12 +26,12 @@ from modgnn_rl import Agent, ModGNN, ModGNNLayer, exporting, make_model
 from modgnn_rl.agent import LinkData
 from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.command import run_command
-from modgnn_rl.communication import GraphAttention, MessagePassing
 from modgnn_rl.configs.schema import DAggerConfig, ExportConfig, ModelConfig, TrainConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.export import main
 from modgnn_rl.exporting import Exported, export_agent
 from modgnn_rl.models import MODELS
+from modgnn_rl.nn.communication import GraphAttention, MessagePassing
 from modgnn_rl.onnx_agent import AgentError, OnnxAgent
 from modgnn_rl.run_folder import RunFolder
 

@@ -38,7 +38,7 @@ from modgnn_rl.models import (
     make_model,
     register_model,
 )
-from modgnn_rl.modgnn import ModGNN, ModGNNLayer
+from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
 from modgnn_rl.training import train
 
 seeds = st.integers(0, 999)

@@ -16,7 +16,7 @@ from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
 from modgnn_rl.dataset import FlightDataset
 from modgnn_rl.evaluation import fly
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.trainers.collection import Flocks, flocks_of_all_sizes, named_flocks, validation_flocks
 from modgnn_rl.trainers.journal import Journal

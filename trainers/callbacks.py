@@ -8,7 +8,7 @@ from typing import Any
 
 from tensordict import TensorDictBase
 
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 
 __all__ = ["Callback", "StopOnPlateau"]
 

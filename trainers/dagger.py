@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from modgnn_rl.configs.schema import DAggerConfig
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.trainers.callbacks import StopOnPlateau
 from modgnn_rl.trainers.collection import flocks_of_all_sizes, named_flocks, validation_flocks
 from modgnn_rl.trainers.journal import Journal

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.func import functional_call, stack_module_state, vmap
 from torchrl.modules import set_recurrent_mode
 
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 
 __all__ = [
     "are_alike",

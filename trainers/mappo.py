@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from modgnn_rl.configs.schema import MAPPOConfig
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.trainers.collection import flocks_of, make_flights, named_flocks
 from modgnn_rl.trainers.journal import Journal
 from modgnn_rl.trainers.measures import flight_metrics, reward_metrics

@@ -15,9 +15,9 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from modgnn_rl.cache import AgentCache
 from modgnn_rl.errors import InputError
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.nn.primer import AgentCache
 
 __all__ = ["Disturbance", "Ensemble", "Mixture", "SafetyGate", "disagreement", "expert_share", "spread"]
 

@@ -15,7 +15,7 @@ from torchrl.objectives import MAPPOLoss, ValueEstimators
 
 from modgnn_rl import distributed
 from modgnn_rl.configs.schema import REFERENCE_SIZE, MAPPOConfig
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.collection import as_windows
 from modgnn_rl.trainers.critic import FlockCritic

@@ -14,7 +14,7 @@ from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
 from modgnn_rl.errors import one_line
 from modgnn_rl.evaluation import Flights, fly, reference_policies
 from modgnn_rl.loggers import Dashboards
-from modgnn_rl.modgnn import ModGNN
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.utils.seeds import derive_seed, seeded

@@ -18,13 +18,13 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from torchrl.modules import recurrent_mode
 
-from modgnn_rl.aggregation import suited_form
-from modgnn_rl.cache import AgentCache
 from modgnn_rl.configs.settings import suggestion
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import Graph
-from modgnn_rl.layer import ModGNNLayer
-from modgnn_rl.topology import FORMS, Topology
+from modgnn_rl.nn.aggregation import suited_form
+from modgnn_rl.nn.graph import Graph
+from modgnn_rl.nn.layer import ModGNNLayer
+from modgnn_rl.nn.primer import AgentCache
+from modgnn_rl.nn.topology import FORMS, Topology
 from modgnn_rl.utils.tensors import is_transformed, keep_rows
 
 __all__ = ["ModGNN", "ModGNNLayer"]
@@ -50,7 +50,7 @@ class ModGNN(TensorDictModuleBase):
     Args:
         layers: one layer or several: `ModGNNLayer`, or another module with its attributes and its forward.
         observation: key of the observations [*B, N, F].
-        adjacency: key of the graph, in any form that `modgnn_rl.topology.Topology` takes: dense [*B, N, N], with
+        adjacency: key of the graph, in any form that `modgnn_rl.nn.topology.Topology` takes: dense [*B, N, N], with
             weights if it is floating-point, or an edge list, int64 [*B, 2, E].
         is_init: key of the flag that an episode begins [*B, 1].
         messages: root key of the recurrent state [*B, N, K, D].

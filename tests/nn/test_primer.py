@@ -17,11 +17,11 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
-from modgnn_rl.cache import AgentCache, missing
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import LocalReynolds
 from modgnn_rl.models import make_model
+from modgnn_rl.nn.primer import AgentCache, missing
 
 FLOCKS, AGENTS = 3, 4
 ACTION = ("agents", "action")

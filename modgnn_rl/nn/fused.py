@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
-from modgnn_rl.communication import Adjacency, Laplacian
-from modgnn_rl.graph import Links
+from modgnn_rl.nn.communication import Adjacency, Laplacian
+from modgnn_rl.nn.graph import Links
 
 __all__ = ["is_linear_map", "rewrite"]
 

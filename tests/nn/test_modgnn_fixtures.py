@@ -14,7 +14,7 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
 
-FIXTURES = Path(os.environ.get("MODGNN_RL_FIXTURES", Path(__file__).parent / "fixtures"))
+FIXTURES = Path(os.environ.get("MODGNN_RL_FIXTURES", Path(__file__).parents[1] / "fixtures"))
 
 
 def _window(observation: torch.Tensor, adjacency: torch.Tensor) -> TensorDict:

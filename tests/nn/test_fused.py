@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 from torch.nn.utils import parametrizations
 
-from modgnn_rl import ModGNNLayer, graph, relu_links
-from modgnn_rl.aggregation import Hop, aggregate
-from modgnn_rl.communication import Adjacency, Laplacian
-from modgnn_rl.graph import Links
-from modgnn_rl.topology import Topology
+from modgnn_rl import ModGNNLayer
+from modgnn_rl.nn import fused, graph
+from modgnn_rl.nn.aggregation import Hop, aggregate
+from modgnn_rl.nn.communication import Adjacency, Laplacian
+from modgnn_rl.nn.graph import Links
+from modgnn_rl.nn.topology import Topology
 
 seeds = st.integers(0, 999)
 few = settings(max_examples=15)
@@ -118,7 +119,7 @@ networks = st.builds(
 def test_rewrites_are_exact(f_com: nn.Module, kind: str, f_pre: nn.Module, links: Links, size: int) -> None:
     hop = held_by(links)
     expected = results(links, f_com, f_pre, hop, kind, at_once=True)
-    assert relu_links.rewrite(links, f_com, f_pre) is not None
+    assert fused.rewrite(links, f_com, f_pre) is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graph, "BLOCK", {"cpu": size})
         equal(results(links, f_com, f_pre, hop, kind), expected)
@@ -134,7 +135,7 @@ def test_gradients_of_a_rewrite_by_finite_differences(f_com: nn.Module, small_bl
     def value(senders: Tensor, receivers: Tensor, *weights: Tensor) -> Tensor:
         return aggregate(many, f_com, f_pre, Hop(senders, receivers, {}))
 
-    assert relu_links.rewrite(many, f_com, f_pre) is not None
+    assert fused.rewrite(many, f_com, f_pre) is not None
     inputs = (hop.senders, hop.receivers, *f_pre.parameters())
     assert torch.autograd.gradcheck(value, inputs, check_undefined_grad=False)
 
@@ -180,7 +181,7 @@ def test_other_modules_are_not_rewritten(name: str, small_blocks: Callable[[int]
     torch.manual_seed(0)
     f_com, f_pre = (module.double() for module in OTHERS[name]())
     many = random_links(6, 5, 0.5)
-    assert relu_links.rewrite(many, f_com, f_pre) is None
+    assert fused.rewrite(many, f_com, f_pre) is None
     hop = held_by(many)
     expected = results(many, f_com, f_pre, hop, "sum", at_once=True)
     small_blocks(5)
@@ -191,10 +192,10 @@ def test_weighted_links_and_autocast_are_not_rewritten() -> None:
     bare = random_links(6, 5, 0.5)
     f_pre = nn.Sequential(nn.Linear(WIDTH, 4), nn.ReLU(), nn.Linear(4, 2))
     weighted = Links(bare.sender, bare.receiver, 6, 5, torch.ones(len(bare)))
-    assert relu_links.rewrite(bare, Laplacian(), f_pre) is not None
-    assert relu_links.rewrite(weighted, Laplacian(), f_pre) is None
+    assert fused.rewrite(bare, Laplacian(), f_pre) is not None
+    assert fused.rewrite(weighted, Laplacian(), f_pre) is None
     with torch.autocast("cpu", torch.bfloat16):
-        assert relu_links.rewrite(bare, Laplacian(), f_pre) is None
+        assert fused.rewrite(bare, Laplacian(), f_pre) is None
 
 
 def test_a_rewritten_policy_acts_and_learns_as_one_with_a_hook() -> None:

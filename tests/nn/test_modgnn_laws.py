@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
-from modgnn_rl.communication import Adjacency
 from modgnn_rl.errors import InputError
+from modgnn_rl.nn.communication import Adjacency
 
 STEPS, AGENTS, FEATURES = 5, 6, 3
 STARTS = ("mask", "zero", "repeat")

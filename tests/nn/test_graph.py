@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from modgnn_rl import ModGNN, ModGNNLayer, graph, topology
-from modgnn_rl.communication import MessagePassing
+from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import Links, Pairs
-from modgnn_rl.topology import Topology
+from modgnn_rl.nn import graph, topology
+from modgnn_rl.nn.communication import MessagePassing
+from modgnn_rl.nn.graph import Links, Pairs
+from modgnn_rl.nn.topology import Topology
 
 seeds = st.integers(0, 999)
 shares = st.sampled_from([0.0, 0.4, 1.0])

@@ -15,11 +15,12 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrizations
 from torchrl.modules import set_recurrent_mode
 
-from modgnn_rl import ModGNN, ModGNNLayer, aggregation, graph
-from modgnn_rl.aggregation import Hop, aggregate
-from modgnn_rl.communication import Adjacency, GraphAttention, Laplacian
-from modgnn_rl.graph import Links
-from modgnn_rl.topology import Topology
+from modgnn_rl import ModGNN, ModGNNLayer
+from modgnn_rl.nn import aggregation, graph
+from modgnn_rl.nn.aggregation import Hop, aggregate
+from modgnn_rl.nn.communication import Adjacency, GraphAttention, Laplacian
+from modgnn_rl.nn.graph import Links
+from modgnn_rl.nn.topology import Topology
 
 seeds = st.integers(0, 999)
 few = settings(max_examples=15)

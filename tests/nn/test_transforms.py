@@ -19,8 +19,9 @@ from torch.func import functional_call, grad, jvp, stack_module_state, vjp, vmap
 from torch.utils.checkpoint import checkpoint
 from torchrl.modules import set_recurrent_mode
 
-from modgnn_rl import ModGNN, ModGNNLayer, aggregation, graph, topology
-from modgnn_rl.communication import GraphAttention, MessagePassing
+from modgnn_rl import ModGNN, ModGNNLayer
+from modgnn_rl.nn import aggregation, graph, topology
+from modgnn_rl.nn.communication import GraphAttention, MessagePassing
 
 FEATURES, AGENTS, STEPS = 2, 4, 4
 ACTION = ("agents", "action")

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from modgnn_rl import ModGNNLayer
-from modgnn_rl.communication import (
+from modgnn_rl.errors import InputError
+from modgnn_rl.nn.communication import (
     Adjacency,
     Communication,
     CoordinateFrame,
@@ -20,9 +21,8 @@ from modgnn_rl.communication import (
     MessagePassing,
     NormalizedAdjacency,
 )
-from modgnn_rl.errors import InputError
-from modgnn_rl.graph import Graph, Pairs
-from modgnn_rl.topology import Topology
+from modgnn_rl.nn.graph import Graph, Pairs
+from modgnn_rl.nn.topology import Topology
 
 seeds = st.integers(0, 999)
 shares = st.sampled_from([0.0, 0.4, 1.0])

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import Graph, Links, Pairs
+from modgnn_rl.nn.graph import Graph, Links, Pairs
 from modgnn_rl.utils.tensors import is_transformed, places_of
 
 __all__ = ["FORMS", "Topology"]

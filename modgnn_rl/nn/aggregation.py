@@ -2,7 +2,7 @@
 
 `aggregate` is the one function that the layers call; a fused kernel would replace it. It chooses between
 
-- the *exact rewrites* of `modgnn_rl.relu_links`, for a plain f_com and an f_pre of linear layers and ReLUs: linear
+- the *exact rewrites* of `modgnn_rl.nn.fused`, for a plain f_com and an f_pre of linear layers and ReLUs: linear
   layers before the first ReLU act on nodes instead of links, those after the last ReLU on the sum;
 - *blocks of links* that stay in the processor's cache, and are computed again in the backward pass instead of being
   stored where there are many; any f_com and f_pre;
@@ -22,9 +22,9 @@ from torch.autograd.function import once_differentiable
 from torch.func import functional_call
 from torch.nn.modules.batchnorm import _NormBase
 
-from modgnn_rl import relu_links
-from modgnn_rl.communication import Communication
-from modgnn_rl.graph import Graph, Links
+from modgnn_rl.nn import fused
+from modgnn_rl.nn.communication import Communication
+from modgnn_rl.nn.graph import Graph, Links
 from modgnn_rl.utils.tensors import is_transformed
 
 __all__ = ["Hop", "aggregate", "call", "suited_form"]
@@ -87,7 +87,7 @@ def aggregate(
 
     Args:
         graph: the links.
-        f_com: see `modgnn_rl.communication`.
+        f_com: see `modgnn_rl.nn.communication`.
         f_pre: a plain module, or one with keys of its own.
         hop: what the agents hold.
         aggregation: ``sum``, ``mean`` or ``max``.
@@ -100,7 +100,7 @@ def aggregate(
         own = {key: graph.at_receivers(value) for key, value in hop.own.items()}
         rows = graph.at_senders(hop.senders), graph.at_receivers(hop.receivers)
         return graph.aggregate(_values(f_com, f_pre, graph, *rows, own, record), aggregation)
-    rewritten = relu_links.rewrite(graph, f_com, f_pre) if aggregation in ("sum", "mean") else None
+    rewritten = fused.rewrite(graph, f_com, f_pre) if aggregation in ("sum", "mean") else None
     if rewritten is not None:
         total = rewritten(hop.senders, hop.receivers)
         return total / graph.degree().clamp(min=1).unsqueeze(-1) if aggregation == "mean" else total

@@ -2,7 +2,7 @@
 
 The nodes of all graphs of a batch are numbered through: agent i of graph g is node ``g N + i``. `Links` computes only
 what is linked; `Pairs` computes all pairs, in shapes that do not depend on the data, as compilers and ``vmap`` need.
-`modgnn_rl.topology.Topology` reads what a user has and chooses the form.
+`modgnn_rl.nn.topology.Topology` reads what a user has and chooses the form.
 """
 
 from __future__ import annotations

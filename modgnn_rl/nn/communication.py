@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import Graph
+from modgnn_rl.nn.graph import Graph
 
 __all__ = [
     "Adjacency",

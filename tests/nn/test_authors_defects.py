@@ -11,7 +11,7 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.agent import Agent
-from modgnn_rl.communication import Adjacency
+from modgnn_rl.nn.communication import Adjacency
 
 FEATURES, AGENTS, STEPS = 2, 5, 4
 ACTION = ("agents", "action")

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
-from modgnn_rl.communication import Adjacency, GraphAttention, Laplacian
 from modgnn_rl.errors import InputError
-from modgnn_rl.topology import Topology
+from modgnn_rl.nn.communication import Adjacency, GraphAttention, Laplacian
+from modgnn_rl.nn.topology import Topology
 
 FEATURES, AGENTS, STEPS = 2, 4, 5
 ACTION = ("agents", "action")

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
-from modgnn_rl.communication import GraphAttention, MessagePassing
 from modgnn_rl.errors import InputError
-from modgnn_rl.topology import FORMS
+from modgnn_rl.nn.communication import GraphAttention, MessagePassing
+from modgnn_rl.nn.topology import FORMS
 
 FEATURES, STEPS = 2, 5
 STARTS = ("mask", "zero", "repeat")

@@ -10,11 +10,11 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 
-from modgnn_rl.aggregation import Hop, Tables, aggregate, call, suited_form
-from modgnn_rl.communication import GraphShift, Laplacian
 from modgnn_rl.errors import InputError
-from modgnn_rl.graph import AGGREGATIONS, Graph
-from modgnn_rl.topology import Topology
+from modgnn_rl.nn.aggregation import Hop, Tables, aggregate, call, suited_form
+from modgnn_rl.nn.communication import GraphShift, Laplacian
+from modgnn_rl.nn.graph import AGGREGATIONS, Graph
+from modgnn_rl.nn.topology import Topology
 from modgnn_rl.utils.tensors import keep_rows, places_of, stack_padded
 
 __all__ = ["STARTS", "ModGNNLayer", "Recorder", "only_finite"]
@@ -65,7 +65,7 @@ class ModGNNLayer(nn.Module):
     Args:
         hops: number of hops K >= 0.
         f_input: encodes the observation.
-        f_com: what an agent makes of one incoming message, see `modgnn_rl.communication`; one module for all hops, or
+        f_com: what an agent makes of one incoming message, see `modgnn_rl.nn.communication`; one module for all hops, or
             a list of K. Default: the Laplacian, incoming minus own.
         f_pre: applied to each incoming datum before the sum over neighbours; one module for all hops, or a list of
             K + 1 (``None`` in it is the identity).

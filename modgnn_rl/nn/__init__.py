@@ -1,0 +1,1 @@
+"""ModGNN: graphs, communication, aggregation, layers, and the policy that they form."""
