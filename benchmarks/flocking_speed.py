@@ -30,7 +30,7 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.quadcopter import Dynamics
 from modgnn_rl.experts import Reynolds
-from modgnn_rl.models import make_model
+from modgnn_rl.models.registry import make_model
 
 REPETITIONS = 5
 BULLET_FLOCKS = 4

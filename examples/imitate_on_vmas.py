@@ -25,7 +25,7 @@ from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv, Unar
 from torchrl.modules import get_primers_from_module
 
 from modgnn_rl import ModGNN, ModGNNLayer
-from modgnn_rl.equivariant import mlp
+from modgnn_rl.models.equivariant import mlp
 from modgnn_rl.trainers.collection import as_windows
 from modgnn_rl.trainers.imitation import imitation_loss
 from modgnn_rl.trainers.mixing import Mixture

@@ -22,7 +22,7 @@ from torchrl.envs import TransformedEnv, UnaryTransform
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.experts import Reynolds
-from modgnn_rl.models import BallHead, Scale
+from modgnn_rl.models.registry import BallHead, Scale
 
 
 class RoleForce(nn.Module):

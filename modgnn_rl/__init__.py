@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from modgnn_rl.agent import Agent
     from modgnn_rl.loading import load_policy
-    from modgnn_rl.models import make_model, register_model
+    from modgnn_rl.models.registry import make_model, register_model
     from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
 
 __version__ = "0.1.0"

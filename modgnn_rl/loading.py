@@ -14,7 +14,7 @@ from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
-from modgnn_rl.models import configured_model
+from modgnn_rl.models.registry import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
 

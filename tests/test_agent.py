@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from modgnn_rl import Agent, ModGNN, ModGNNLayer, make_model
 from modgnn_rl.agent import LinkData, step
 from modgnn_rl.errors import InputError
-from modgnn_rl.models import MODELS
+from modgnn_rl.models.registry import MODELS
 from modgnn_rl.nn.communication import (
     Adjacency,
     CoordinateFrame,

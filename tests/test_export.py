@@ -30,7 +30,7 @@ from modgnn_rl.configs.schema import DAggerConfig, ExportConfig, ModelConfig, Tr
 from modgnn_rl.errors import InputError
 from modgnn_rl.export import main
 from modgnn_rl.exporting import Exported, export_agent
-from modgnn_rl.models import MODELS
+from modgnn_rl.models.registry import MODELS
 from modgnn_rl.nn.communication import GraphAttention, MessagePassing
 from modgnn_rl.onnx_agent import AgentError, OnnxAgent
 from modgnn_rl.run_folder import RunFolder

@@ -14,7 +14,7 @@ from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRo
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, CollectorConfig, FlockingConfig, ImitationConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.equivariant import is_equivariant
+from modgnn_rl.models.equivariant import is_equivariant
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.trainers.imitation import are_alike
 from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture, SafetyGate, spread

@@ -16,7 +16,7 @@ from torchrl.data import ReplayBuffer
 
 from modgnn_rl import distributed
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ImitationConfig
-from modgnn_rl.equivariant import is_equivariant
+from modgnn_rl.models.equivariant import is_equivariant
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.trainers.imitation import (
     are_alike,

@@ -22,7 +22,7 @@ from modgnn_rl.envs.leader import NoiseLeader
 from modgnn_rl.envs.rewards import flocking_costs, flocking_reward, reward_weights
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import LocalReynolds, Reynolds, as_matrix
-from modgnn_rl.models import make_model
+from modgnn_rl.models.registry import make_model
 from modgnn_rl.utils.tensors import pair_distances
 
 NAN = math.nan

@@ -18,7 +18,7 @@ from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.workers import ParallelFlocks, parallel_flocks
 from modgnn_rl.errors import InputError
-from modgnn_rl.models import make_model
+from modgnn_rl.models.registry import make_model
 from modgnn_rl.utils.seeds import derive_seed
 
 WORKERS, FLOCKS, AGENTS = 2, 2, 3

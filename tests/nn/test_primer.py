@@ -20,7 +20,7 @@ from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.experts import LocalReynolds
-from modgnn_rl.models import make_model
+from modgnn_rl.models.registry import make_model
 from modgnn_rl.nn.primer import AgentCache, missing
 
 FLOCKS, AGENTS = 3, 4

@@ -26,9 +26,9 @@ from modgnn_rl.configs.schema import (
     ModelConfig,
     TrainConfig,
 )
-from modgnn_rl.equivariant import VectorSquash
 from modgnn_rl.errors import InputError
-from modgnn_rl.models import (
+from modgnn_rl.models.equivariant import VectorSquash
+from modgnn_rl.models.registry import (
     MODELS,
     BallHead,
     LayerSpec,
@@ -191,7 +191,7 @@ def test_counts_of_parameters(hops: int, hidden: int) -> None:
 
 
 def test_the_table_of_models_in_the_documentation_is_true() -> None:
-    page = (Path(__file__).parent.parent / "docs" / "modgnn.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "modgnn.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)`(, two layers)? \|[^|]*\| ([\d,]+) \| ([\d,]+) \| ([\d,]+) \|$", page, re.MULTILINE)
     assert {name for name, *_ in rows} == set(MODELS)
     for name, two_layers, *counts in rows:
@@ -236,7 +236,7 @@ def test_a_model_of_ones_own_is_trained_and_loaded_by_its_name(own_names: None, 
 
 def test_an_installed_package_brings_models(own_names: None, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = EntryPoint("plugged", "modgnn_rl.models:gcn", MODEL_PLUGINS)
-    monkeypatch.setattr("modgnn_rl.models.entry_points", lambda **_: EntryPoints([entry]))
+    monkeypatch.setattr("modgnn_rl.models.registry.entry_points", lambda **_: EntryPoints([entry]))
     assert make_model("plugged", seed=0).state_dict().keys() == make_model("gcn").state_dict().keys()
     assert "plugged" in MODEL_NAMES
 

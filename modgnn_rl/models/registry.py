@@ -19,11 +19,11 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from modgnn_rl.central import CentralLayer
 from modgnn_rl.configs.schema import BUILT_IN_MODELS, MODEL_NAMES, MODEL_PLUGINS, FlockingConfig, ModelConfig
 from modgnn_rl.configs.settings import suggestion
-from modgnn_rl.equivariant import VELOCITY_SCALE, Moments, PairForce, VectorSquash, mlp
 from modgnn_rl.errors import InputError
+from modgnn_rl.models.central import CentralLayer
+from modgnn_rl.models.equivariant import VELOCITY_SCALE, Moments, PairForce, VectorSquash, mlp
 from modgnn_rl.nn.communication import Adjacency, GraphAttention, MessagePassing
 from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
 from modgnn_rl.utils.seeds import seeded

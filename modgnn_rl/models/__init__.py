@@ -1,0 +1,1 @@
+"""The models by name: configurations of ModGNN's submodules."""
