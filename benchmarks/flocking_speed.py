@@ -28,8 +28,8 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.envs.quadcopter import Dynamics
-from modgnn_rl.experts import Reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds
+from modgnn_rl.envs.flocking.physics.quadcopter import Dynamics
 from modgnn_rl.models.registry import make_model
 
 REPETITIONS = 5
@@ -158,7 +158,7 @@ def collect(envs: int, agents: int, policy: TensorDictModuleBase, config: Flocki
 
 def peers(agents: int) -> Iterator[tuple[str, int, Loop]]:
     """Yield other simulators: a name, its flocks, and a function that flies some steps and returns how many."""
-    from modgnn_rl.envs.bullet import BulletPhysics
+    from modgnn_rl.envs.flocking.physics.bullet import BulletPhysics
 
     bullet = BulletPhysics(BULLET_FLOCKS, agents, Dynamics())
     bullet.reset(

@@ -19,7 +19,7 @@ from torchrl.data import ReplayBuffer
 
 from modgnn_rl import ModGNN, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
-from modgnn_rl.experts import Reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.trainers.collection import Flocks
 from modgnn_rl.trainers.imitation import imitation_loss, stacked_losses
 from modgnn_rl.trainers.learner import Learner

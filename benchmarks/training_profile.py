@@ -63,7 +63,7 @@ def watched() -> Clock:
 
     from modgnn_rl import training
     from modgnn_rl.envs import FlockingEnv
-    from modgnn_rl.experts import Reynolds
+    from modgnn_rl.envs.flocking.expert import Reynolds
     from modgnn_rl.nn.modgnn import ModGNN
     from modgnn_rl.trainers import learner
     from modgnn_rl.trainers.collection import FlockCollector, Flocks

@@ -19,7 +19,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from modgnn_rl.configs.schema import DAggerConfig, EvaluationConfig, FlockingConfig, TrainConfig
-from modgnn_rl.experts import reynolds
+from modgnn_rl.envs.flocking.expert import reynolds
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.training import train
 

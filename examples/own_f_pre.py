@@ -21,7 +21,7 @@ from torchrl.envs import TransformedEnv, UnaryTransform
 
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.experts import Reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.models.registry import BallHead, Scale
 
 

@@ -21,7 +21,7 @@ from torchrl.envs import Transform, TransformedEnv
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.envs.rewards import flocking_costs, flocking_reward
+from modgnn_rl.envs.flocking.rewards import flocking_costs, flocking_reward
 from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.critic import FlockCritic
 from modgnn_rl.trainers.ppo import AnchoredMAPPOLoss

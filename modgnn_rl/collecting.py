@@ -23,8 +23,8 @@ from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.dataset import WITHOUT_EFFECT
 from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.experts import Reynolds
 from modgnn_rl.manifest import FILES, Manifest, check_shard, describe_files, num_bytes, recordable
 from modgnn_rl.training import prepare_torch
 from modgnn_rl.utils.files import fsync_file, fsync_folder

@@ -15,8 +15,8 @@ from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.experts import LocalReynolds, Reynolds
-from modgnn_rl.metrics import (
+from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
+from modgnn_rl.envs.flocking.metrics import (
     action_error,
     cohesion,
     is_diverged,
@@ -139,7 +139,7 @@ def fly(
         device: where to fly.
         progress: counts flock-steps.
         expert: what errors are measured against, writes ``("agents", "expert_action")``; default: Reynolds flocking.
-        watch: is shown the flocks before each step, with both actions; see `modgnn_rl.recording.Recorder`.
+        watch: is shown the flocks before each step, with both actions; see `modgnn_rl.envs.flocking.recording.Recorder`.
     """
     env = endless_env(policy, config, num_flocks, num_agents, steps=steps, seed=seed, device=device)
     expert = expert or Reynolds.for_env(config)

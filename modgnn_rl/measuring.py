@@ -15,10 +15,10 @@ from tensordict.nn import TensorDictModuleBase
 from modgnn_rl.cells import Outcome, Result
 from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig
 from modgnn_rl.dataset import FlightDataset
+from modgnn_rl.envs.flocking.expert import LocalReynolds
+from modgnn_rl.envs.flocking.metrics import action_error
 from modgnn_rl.evaluation import Flights, fly, reference_policies
-from modgnn_rl.experts import LocalReynolds
 from modgnn_rl.loading import load_policy
-from modgnn_rl.metrics import action_error
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.studies import Study, Subject, World
 from modgnn_rl.trainers.imitation import imitation_loss

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modgnn_rl.recording import METRICS, QUANTUM, Recording
+from modgnn_rl.envs.flocking.recording import METRICS, QUANTUM, Recording
 from modgnn_rl.utils.files import write_atomically
 
 __all__ = ["pack", "replay_page", "write_replay"]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modgnn_rl.recording import QUANTUM, Recording
+from modgnn_rl.envs.flocking.recording import QUANTUM, Recording
 from modgnn_rl.utils.files import write_atomically
 
 __all__ = ["write_picture"]

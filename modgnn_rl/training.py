@@ -20,12 +20,12 @@ from modgnn_rl import distributed
 from modgnn_rl.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
 from modgnn_rl.configs.settings import check
+from modgnn_rl.envs.flocking.recording import Recorder, spacing
 from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation import evaluate
 from modgnn_rl.loading import changed_world, load_policy
 from modgnn_rl.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.recording import Recorder, spacing
 from modgnn_rl.replay_page import write_replay
 from modgnn_rl.resuming import begins_anew, changed_config, differences, stored_config
 from modgnn_rl.run_folder import RunFolder

@@ -23,8 +23,8 @@ from modgnn_rl.collecting import collect
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
 from modgnn_rl.dataset import FlightDataset
 from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.experts import Reynolds
 from modgnn_rl.manifest import MANIFEST, STATE
 from modgnn_rl.utils.seeds import derive_seed
 

@@ -14,10 +14,10 @@ import pytest
 
 from modgnn_rl import replay_page
 from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig
+from modgnn_rl.envs.flocking.expert import as_matrix
+from modgnn_rl.envs.flocking.recording import METRICS, QUANTUM, Recorder, Recording, spacing
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation import fly, reference_policies
-from modgnn_rl.experts import as_matrix
-from modgnn_rl.recording import METRICS, QUANTUM, Recorder, Recording, spacing
 from modgnn_rl.replay import refuse
 from modgnn_rl.replaying import record
 

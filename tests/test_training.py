@@ -25,8 +25,8 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
     WorldChanges,
 )
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.experts import Reynolds
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.train import main
 from modgnn_rl.trainers import watching

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.experts import Reynolds
 from modgnn_rl.videos import Frame, as_gif, film, write_video
 
 

@@ -6,8 +6,7 @@ import torch
 from tensordict import TensorDictBase
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.rewards import flocking_costs
-from modgnn_rl.metrics import (
+from modgnn_rl.envs.flocking.metrics import (
     action_error,
     cohesion,
     is_diverged,
@@ -16,6 +15,7 @@ from modgnn_rl.metrics import (
     separation,
     smallest_distance,
 )
+from modgnn_rl.envs.flocking.rewards import flocking_costs
 from modgnn_rl.utils.tensors import pair_distances
 
 __all__ = ["flight_metrics", "reward_metrics"]
@@ -32,7 +32,7 @@ def flight_metrics(flights: TensorDictBase, world: FlockingConfig) -> dict[str, 
 
     Returns:
         the error of the actions where the policy flew (NaN where the expert flew throughout), and at a few steps,
-        whoever flew, the other metrics of `modgnn_rl.metrics`.
+        whoever flew, the other metrics of `modgnn_rl.envs.flocking.metrics`.
     """
     agents = flights["agents"]
     flown, expert_flies = agents["controlled"], flights.get("expert_flies", None)

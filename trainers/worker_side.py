@@ -20,7 +20,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.workers import make_flocks
+from modgnn_rl.envs.parallel import make_flocks
 from modgnn_rl.errors import InputError
 from modgnn_rl.trainers.mixing import Mixture
 from modgnn_rl.utils.seeds import derive_seed

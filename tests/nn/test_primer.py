@@ -18,8 +18,8 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.envs.flocking.expert import LocalReynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.experts import LocalReynolds
 from modgnn_rl.models.registry import make_model
 from modgnn_rl.nn.primer import AgentCache, missing
 

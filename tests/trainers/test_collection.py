@@ -9,7 +9,7 @@ from torch import nn
 
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, TrainConfig
-from modgnn_rl.experts import Reynolds, reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds, reynolds
 from modgnn_rl.trainers.collection import Flocks, as_windows, flocks_of_all_sizes
 
 

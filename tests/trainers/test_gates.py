@@ -12,7 +12,7 @@ from modgnn_rl import load_policy, make_model, training
 from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.experts import Reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.trainers.collection import Flocks
 from modgnn_rl.trainers.mixing import Disturbance, Ensemble, SafetyGate, disagreement, spread
 from modgnn_rl.training import train

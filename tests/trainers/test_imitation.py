@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
-from modgnn_rl.experts import Reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.trainers.collection import Flocks, as_windows, stores_messages, window_of
 from modgnn_rl.trainers.imitation import (
     hide_velocities,

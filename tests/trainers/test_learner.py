@@ -10,7 +10,7 @@ import torch
 
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
-from modgnn_rl.experts import Reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.trainers.collection import Flocks
 from modgnn_rl.trainers.learner import Learner, cosine_learning_rate
 

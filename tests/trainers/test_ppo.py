@@ -11,7 +11,7 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig, MAPPOConfig
-from modgnn_rl.experts import Reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.trainers.collection import FlockCollector
 from modgnn_rl.trainers.ppo import RECEIVERS, Improver
 

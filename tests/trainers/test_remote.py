@@ -20,8 +20,8 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.experts import Reynolds
 from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.collection import FlockCollector
 from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture
@@ -36,7 +36,7 @@ SCRIPT = """
 import os, sys
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
-from modgnn_rl.experts import Reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.trainers.remote import RemoteFlights
 if __name__ == "__main__":
     flown = (make_model("gcn", seed=0), Reynolds())

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
-from modgnn_rl.experts import Reynolds
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.trainers.collection import Flocks, reservoir_places
 
 

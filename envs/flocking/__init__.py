@@ -1,0 +1,1 @@
+"""The flocking task: quadcopters that follow a leader."""

@@ -1,0 +1,1 @@
+"""The flocking environment for Gymnasium and PettingZoo."""

@@ -1,0 +1,1 @@
+"""Quadcopter physics in torch and in PyBullet behind one interface."""
