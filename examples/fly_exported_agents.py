@@ -19,10 +19,10 @@ from torchrl.envs import InitTracker, TransformedEnv
 
 from modgnn_rl import ModGNN, load_policy, make_model
 from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.deploy.export import export_agent
+from modgnn_rl.deploy.onnx_agent import OnnxAgent
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.exporting import export_agent
 from modgnn_rl.loading import stored_world
-from modgnn_rl.onnx_agent import OnnxAgent
 from modgnn_rl.run_folder import RunFolder
 
 

@@ -10,7 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from modgnn_rl.agent import Agent
+    from modgnn_rl.deploy.agent import Agent
     from modgnn_rl.loading import load_policy
     from modgnn_rl.models.registry import make_model, register_model
     from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
@@ -19,7 +19,7 @@ __version__ = "0.1.0"
 __all__ = ["Agent", "ModGNN", "ModGNNLayer", "__version__", "load_policy", "make_model", "register_model"]
 
 _HOMES = {
-    "Agent": "modgnn_rl.agent",
+    "Agent": "modgnn_rl.deploy.agent",
     "ModGNN": "modgnn_rl.nn.modgnn",
     "ModGNNLayer": "modgnn_rl.nn.modgnn",
     "load_policy": "modgnn_rl.loading",

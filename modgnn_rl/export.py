@@ -12,7 +12,7 @@ from modgnn_rl.configs.schema import ExportConfig
 from modgnn_rl.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from modgnn_rl.exporting import Exported
+    from modgnn_rl.deploy.export import Exported
     from modgnn_rl.nn.modgnn import ModGNN
 
 NEIGHBOURS = 10  # whose messages come in while the latency is measured
@@ -28,7 +28,7 @@ def main(config: ExportConfig) -> None:
         python -m modgnn_rl.export 'run=runs/<date>-<name>' output=robot
     """
     RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
-    from modgnn_rl.exporting import export_run
+    from modgnn_rl.deploy.export import export_run
 
     print(report(*export_run(config)))
 
@@ -37,14 +37,14 @@ def report(exported: Exported, policy: ModGNN) -> str:
     """Sizes, largest difference and latency of an exported agent that reads its observation alone, and how to fly it.
 
     Args:
-        exported: what `modgnn_rl.exporting.export_agent` made.
+        exported: what `modgnn_rl.deploy.export.export_agent` made.
         policy: of this policy.
     """
     import torch
 
-    from modgnn_rl.agent import Agent
-    from modgnn_rl.exporting import TOLERANCE
-    from modgnn_rl.onnx_agent import OnnxAgent
+    from modgnn_rl.deploy.agent import Agent
+    from modgnn_rl.deploy.export import TOLERANCE
+    from modgnn_rl.deploy.onnx_agent import OnnxAgent
 
     about, dtype = exported.metadata, getattr(torch, exported.metadata["dtype"])
     observation = torch.zeros(about["observation_width"], dtype=dtype)

@@ -10,7 +10,7 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
-from modgnn_rl.agent import Agent
+from modgnn_rl.deploy.agent import Agent
 from modgnn_rl.nn.communication import Adjacency
 
 FEATURES, AGENTS, STEPS = 2, 5, 4

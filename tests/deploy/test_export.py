@@ -22,20 +22,21 @@ from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from modgnn_rl import Agent, ModGNN, ModGNNLayer, exporting, make_model
-from modgnn_rl.agent import LinkData
+from modgnn_rl import Agent, ModGNN, ModGNNLayer, make_model
 from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import DAggerConfig, ExportConfig, ModelConfig, TrainConfig
+from modgnn_rl.deploy import export
+from modgnn_rl.deploy.agent import LinkData
+from modgnn_rl.deploy.export import Exported, export_agent
+from modgnn_rl.deploy.onnx_agent import AgentError, OnnxAgent
 from modgnn_rl.errors import InputError
 from modgnn_rl.export import main
-from modgnn_rl.exporting import Exported, export_agent
 from modgnn_rl.models.registry import MODELS
 from modgnn_rl.nn.communication import GraphAttention, MessagePassing
-from modgnn_rl.onnx_agent import AgentError, OnnxAgent
 from modgnn_rl.run_folder import RunFolder
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 NEIGHBOURS = (3, 0, 1, 2, 7, 40, 5)
 FEATURES, WIDTH = 6, 4
 OWN = {("sensors", "battery"): torch.zeros(1)}
@@ -337,7 +338,7 @@ def test_a_folder_of_something_else_stays(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("broken", ["fsync_file", "fsync_folder"])
 def test_a_full_disk_leaves_the_older_export(broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    exporting.write_folder(tmp_path / "agent", {"agent.json": b"old", "agent.onnx": b"old"})
+    export.write_folder(tmp_path / "agent", {"agent.json": b"old", "agent.onnx": b"old"})
 
     def full(path: Path) -> None:
         raise OSError(28, "No space left on device")
@@ -345,12 +346,12 @@ def test_a_full_disk_leaves_the_older_export(broken: str, tmp_path: Path, monkey
     with monkeypatch.context() as patch:
         patch.setattr(exporting, broken, full)
         with pytest.raises(InputError, match=r"cannot write .*No space left on device"):
-            exporting.write_folder(tmp_path / "agent", {"agent.json": b"new"})
+            export.write_folder(tmp_path / "agent", {"agent.json": b"new"})
     assert {file.name: file.read_bytes() for file in (tmp_path / "agent").iterdir()} == {
         "agent.json": b"old",
         "agent.onnx": b"old",
     }
-    exporting.write_folder(tmp_path / "agent", {"agent.json": b"new"})
+    export.write_folder(tmp_path / "agent", {"agent.json": b"new"})
     assert [file.read_bytes() for file in (tmp_path / "agent").iterdir()] == [b"new"]
     assert [folder.name for folder in tmp_path.iterdir()] == ["agent"]
 

@@ -21,9 +21,9 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from modgnn_rl.agent import LinkData, check_local, link_data, no_messages, own_data, step
 from modgnn_rl.configs.schema import ExportConfig
 from modgnn_rl.configs.settings import check
+from modgnn_rl.deploy.agent import LinkData, check_local, link_data, no_messages, own_data, step
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.loading import load_policy, stored_world
@@ -67,17 +67,17 @@ def export_agent(
     model: str | None = None,
     control_frequency: float | None = None,
 ) -> Exported:
-    """Export what one agent computes in a step, `modgnn_rl.agent.step`, for any number of neighbours.
+    """Export what one agent computes in a step, `modgnn_rl.deploy.agent.step`, for any number of neighbours.
 
     Nothing is written unless the files compute what the policy does, to `TOLERANCE`, on a short random flight with 0 to
-    40 neighbours. `modgnn_rl.onnx_agent.OnnxAgent` flies them.
+    40 neighbours. `modgnn_rl.deploy.onnx_agent.OnnxAgent` flies them.
 
     Args:
-        policy: see `modgnn_rl.agent.check_local`; a copy in evaluation mode is exported.
+        policy: see `modgnn_rl.deploy.agent.check_local`; a copy in evaluation mode is exported.
         folder: where the files go; it may hold an earlier export, which is replaced as a whole.
         observation: an example of an observation [F], for its width and dtype, float32 or float64.
         own: examples of the agent's own data for keyed submodules, by name [...].
-        links: what is known of links, as for `modgnn_rl.agent.Agent`.
+        links: what is known of links, as for `modgnn_rl.deploy.agent.Agent`.
         model: name of the policy, for ``agent.json``.
         control_frequency: steps a second that the policy was trained for, Hz, for ``agent.json``.
 
@@ -225,7 +225,7 @@ def _largest_difference(
     module: _Step, program: torch.export.ExportedProgram, onnx_model: bytes, inputs: Inputs
 ) -> float:
     """Largest relative difference of both exports from the policy, on a random flight; infinite where NaN differ."""
-    from modgnn_rl.onnx_agent import open_session
+    from modgnn_rl.deploy.onnx_agent import open_session
 
     try:
         session = open_session(onnx_model)
@@ -266,7 +266,7 @@ def _difference(expected: Tensor, found: Tensor) -> float:
 
 
 def _metadata(policy: ModGNN, module: _Step, inputs: Inputs, models: Mapping[str, bytes]) -> dict[str, Any]:
-    from modgnn_rl.onnx_agent import SCHEMA_VERSION
+    from modgnn_rl.deploy.onnx_agent import SCHEMA_VERSION
 
     action, messages = module(*inputs.values())
     return {

@@ -36,7 +36,7 @@ class AgentError(ValueError):
 
 
 class OnnxAgent:
-    """One robot that flies by an exported policy; it does what `modgnn_rl.agent.Agent` does, on numpy arrays.
+    """One robot that flies by an exported policy; it does what `modgnn_rl.deploy.agent.Agent` does, on numpy arrays.
 
     Args:
         path: the folder that the export made, or ``agent.onnx`` in it. Its hash is checked.

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from modgnn_rl import Agent, ModGNN, ModGNNLayer, make_model
-from modgnn_rl.agent import LinkData, step
+from modgnn_rl.deploy.agent import LinkData, step
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.registry import MODELS
 from modgnn_rl.nn.communication import (
