@@ -15,7 +15,7 @@ def main(config: CollectConfig) -> None:
         python -m modgnn_rl.collect env=paper env.compile=true threads=2
         python -m modgnn_rl.collect env.num_agents=16 output=datasets/small-flocks
     """
-    from modgnn_rl.collecting import collect, report
+    from modgnn_rl.data.collect import collect, report
 
     print(report(collect(config)))
 

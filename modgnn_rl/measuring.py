@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.cells import Outcome, Result
 from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig
-from modgnn_rl.dataset import FlightDataset
+from modgnn_rl.data.dataset import FlightDataset
 from modgnn_rl.envs.flocking.expert import LocalReynolds
 from modgnn_rl.envs.flocking.metrics import action_error
 from modgnn_rl.evaluation import Flights, fly, reference_policies

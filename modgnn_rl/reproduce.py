@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig
 from modgnn_rl.configs.settings import flat
+from modgnn_rl.data.manifest import recordable
 from modgnn_rl.errors import InputError
-from modgnn_rl.manifest import recordable
 from modgnn_rl.utils.files import write_atomically
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from modgnn_rl.cells import Cell, Result
-from modgnn_rl.collecting import collect
 from modgnn_rl.configs.schema import (
     BCConfig,
     CollectConfig,
@@ -21,6 +20,7 @@ from modgnn_rl.configs.schema import (
     ReproduceConfig,
     TrainConfig,
 )
+from modgnn_rl.data.collect import collect
 from modgnn_rl.measuring import VALIDATION, flight_cell, fly_references, fly_subject, look_on, validate
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.studies import Study, Subject, World

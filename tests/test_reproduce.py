@@ -83,7 +83,7 @@ def test_validation_is_the_error_of_a_policy_that_looks_on(reproduction):
     """An independent way to the same number: step by step, the policy's action written beside the expert's."""
     from tensordict import TensorDict
 
-    from modgnn_rl.dataset import FlightDataset
+    from modgnn_rl.data.dataset import FlightDataset
 
     folder, config, study, outcome = reproduction
     policy = load_policy(folder / outcome.results["tables-cloning-gcn-K12-seed0"]["policies"]["gcn-K2"])

@@ -14,7 +14,7 @@ from torchrl.data import ReplayBuffer
 from modgnn_rl import distributed
 from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
-from modgnn_rl.dataset import FlightDataset
+from modgnn_rl.data.dataset import FlightDataset
 from modgnn_rl.evaluation import fly
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder

@@ -15,7 +15,7 @@ from modgnn_rl.configs.schema import (
     TrainerConfig,
     as_list,
 )
-from modgnn_rl.dataset import FlightDataset
+from modgnn_rl.data.dataset import FlightDataset
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.loading import load_policy, stored_model

@@ -11,7 +11,6 @@ import torch
 
 from modgnn_rl import make_model, training
 from modgnn_rl.checkpoint import load_checkpoint
-from modgnn_rl.collecting import collect
 from modgnn_rl.configs.schema import (
     BCConfig,
     CollectConfig,
@@ -19,7 +18,8 @@ from modgnn_rl.configs.schema import (
     ModelConfig,
     TrainConfig,
 )
-from modgnn_rl.dataset import FlightDataset, FlightWindows
+from modgnn_rl.data.collect import collect
+from modgnn_rl.data.dataset import FlightDataset, FlightWindows
 from modgnn_rl.errors import InputError
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.trainers.learner import Learner

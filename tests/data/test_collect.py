@@ -16,13 +16,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from modgnn_rl import collecting, manifest
-from modgnn_rl.collecting import collect, fly_expert, report
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
-from modgnn_rl.dataset import FlightDataset
+from modgnn_rl.data import collect, manifest
+from modgnn_rl.data.collect import collect, fly_expert, report
+from modgnn_rl.data.dataset import FlightDataset
+from modgnn_rl.data.manifest import MANIFEST, STATE, Manifest
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
-from modgnn_rl.manifest import MANIFEST, STATE, Manifest
 
 WORLD = FlockingConfig(num_agents=4)
 
@@ -55,10 +55,10 @@ class Killed(BaseException):
 
 
 STOPS: list[tuple[Any, str]] = [
-    (collecting, "fly_expert"),
-    (collecting, "fsync_file"),
+    (collect, "fly_expert"),
+    (collect, "fsync_file"),
     (os, "replace"),
-    (collecting, "describe_files"),
+    (collect, "describe_files"),
     (manifest, "write_atomically"),
     (TensorDict, "memmap"),
 ]
@@ -110,7 +110,7 @@ def test_ctrl_c_says_how_far_it_got(
             raise KeyboardInterrupt
         return real(env, *arguments)
 
-    monkeypatch.setattr(collecting, "fly_expert", interrupted)
+    monkeypatch.setattr(collect, "fly_expert", interrupted)
     with pytest.raises(KeyboardInterrupt):
         collect(config(tmp_path / "set"))
     assert "has 2 of 3 shards, and the same command goes on from there" in capsys.readouterr().err

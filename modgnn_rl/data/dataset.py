@@ -24,9 +24,9 @@ from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 from torchrl.data.replay_buffers import Storage
 
 from modgnn_rl.configs.schema import FlockingConfig, as_list
+from modgnn_rl.data.manifest import MANIFEST, STATE, Manifest, check_shard
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.manifest import MANIFEST, STATE, Manifest, check_shard
 from modgnn_rl.utils.tensors import pair_distances
 
 __all__ = ["WITHOUT_EFFECT", "FlightDataset", "FlightWindows"]

@@ -19,13 +19,13 @@ from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
 from modgnn_rl import make_model
-from modgnn_rl.collecting import collect
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
-from modgnn_rl.dataset import FlightDataset
+from modgnn_rl.data.collect import collect
+from modgnn_rl.data.dataset import FlightDataset
+from modgnn_rl.data.manifest import MANIFEST, STATE
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.manifest import MANIFEST, STATE
 from modgnn_rl.utils.seeds import derive_seed
 
 WORLD = FlockingConfig(num_agents=6, comm_range=2.0, separation_gain=0.7, leader_max_speed=float("inf"))

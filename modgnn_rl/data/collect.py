@@ -21,11 +21,11 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
 from modgnn_rl.configs.settings import check
-from modgnn_rl.dataset import WITHOUT_EFFECT
+from modgnn_rl.data.dataset import WITHOUT_EFFECT
+from modgnn_rl.data.manifest import FILES, Manifest, check_shard, describe_files, num_bytes, recordable
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.manifest import FILES, Manifest, check_shard, describe_files, num_bytes, recordable
 from modgnn_rl.training import prepare_torch
 from modgnn_rl.utils.files import fsync_file, fsync_folder
 from modgnn_rl.utils.progress import Progress
@@ -38,7 +38,7 @@ LEFTOVER = re.compile(r"shard_\d{5,}\.tmp|\.manifest\.json\.\d+\.tmp")  # of a p
 
 
 def collect(config: CollectConfig) -> Path:
-    """Fly the expert and write a dataset, or what is missing of it; see `modgnn_rl.manifest` for its files.
+    """Fly the expert and write a dataset, or what is missing of it; see `modgnn_rl.data.manifest` for its files.
 
     Each shard has a seed of its own and is written whole or not at all: whatever interrupts a collection, the same
     settings later lead to the same dataset, bit for bit on the same machine.

@@ -1,0 +1,1 @@
+"""Datasets of expert episodes: collect, store, verify and load them."""
