@@ -27,7 +27,7 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.envs.flocking.metrics import smallest_distance
-from modgnn_rl.evaluation import fly
+from modgnn_rl.evaluation.rollout import fly
 from modgnn_rl.trainers.collection import as_windows
 from modgnn_rl.trainers.imitation import imitation_loss, random_receivers
 from modgnn_rl.trainers.mixing import Disturbance, Mixture, SafetyGate, disagreement

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from modgnn_rl.evaluation.statistics import Interval, probability_of_improvement
 from modgnn_rl.measuring import VALIDATION, Measurements
 from modgnn_rl.paper_tables import NAMES, mean, published, shown, spread
-from modgnn_rl.statistics import Interval, probability_of_improvement
 from modgnn_rl.studies import HOPS, Subject
 from modgnn_rl.tabular import Table
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from modgnn_rl.evaluation.statistics import Interval, interquartile_interval
 from modgnn_rl.measuring import VALIDATION, Measurements
-from modgnn_rl.statistics import Interval, interquartile_interval
 from modgnn_rl.studies import Subject
 from modgnn_rl.tabular import Table
 

@@ -24,7 +24,7 @@ COLOURS = {"agent": (23, 32, 51), "leader": (208, 31, 46), "link": (227, 181, 5)
 
 
 class Viewer:
-    """Shows the first flock that `modgnn_rl.evaluation.fly` shows it, at the pace of its clock or slower.
+    """Shows the first flock that `modgnn_rl.evaluation.rollout.fly` shows it, at the pace of its clock or slower.
 
     Args:
         config: the world.

@@ -14,7 +14,7 @@ from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig, as_list
 from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.recording import Recorder, Recording, spacing
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation import fly, reference_policies
+from modgnn_rl.evaluation.rollout import fly, reference_policies
 from modgnn_rl.loading import changed_world, load_policy
 from modgnn_rl.replay_page import write_replay
 from modgnn_rl.run_folder import RunFolder
@@ -126,7 +126,7 @@ def record(
     """Fly one flock with a policy and keep what it looks like, for `modgnn_rl.replay_page.write_replay`.
 
     Args:
-        policy: as `modgnn_rl.evaluation.fly` flies it.
+        policy: as `modgnn_rl.evaluation.rollout.fly` flies it.
         world: the world.
         num_agents: agents in the flock.
         steps: steps of the flight, which goes on whatever happens to the flock.

@@ -17,7 +17,7 @@ from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig
 from modgnn_rl.envs.flocking.expert import as_matrix
 from modgnn_rl.envs.flocking.recording import METRICS, QUANTUM, Recorder, Recording, spacing
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation import fly, reference_policies
+from modgnn_rl.evaluation.rollout import fly, reference_policies
 from modgnn_rl.replay import refuse
 from modgnn_rl.replaying import record
 

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
 from modgnn_rl.errors import one_line
-from modgnn_rl.evaluation import Flights, fly, reference_policies
+from modgnn_rl.evaluation.rollout import Flights, fly, reference_policies
 from modgnn_rl.loggers import Dashboards
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.run_folder import RunFolder
@@ -179,7 +179,7 @@ def log_evaluation(dashboards: Dashboards, tables: Mapping[int, Mapping[str, Any
 
     Args:
         dashboards: where.
-        tables: by number of agents, as `modgnn_rl.table.summarise_flights` makes them.
+        tables: by number of agents, as `modgnn_rl.evaluation.table.summarise_flights` makes them.
     """
     means = ("error", "leader_distance", "cohesion", "separation", "near_collisions", "reward")
     plain = ("smallest_distance_ever", "lost", "diverged")

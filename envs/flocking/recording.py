@@ -80,7 +80,7 @@ def links_in_range(position: Array, present: Array, comm_range: float) -> Array:
 
 @dataclass
 class Recorder:
-    """Keeps one flock of the flights that `modgnn_rl.evaluation.fly` shows it, step by step.
+    """Keeps one flock of the flights that `modgnn_rl.evaluation.rollout.fly` shows it, step by step.
 
     Args:
         config: the world.

@@ -18,7 +18,7 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
 )
 from modgnn_rl.dashboards import Dashboard
-from modgnn_rl.evaluation import fly, reference_policies
+from modgnn_rl.evaluation.rollout import fly, reference_policies
 from modgnn_rl.loggers import Dashboards
 from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.trainers import watching

@@ -13,8 +13,8 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import TorchPhysics
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation import evaluate, fly, reference_policies
-from modgnn_rl.table import as_markdown, read_tables, summarise_flights
+from modgnn_rl.evaluation.rollout import evaluate, fly, reference_policies
+from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_flights
 
 FLIGHT = {"num_agents": 6, "num_flocks": 4, "steps": 40, "seed": 3}
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation import Flights
-from modgnn_rl.statistics import paired_difference, summarise
+from modgnn_rl.evaluation.rollout import Flights
+from modgnn_rl.evaluation.statistics import paired_difference, summarise
 from modgnn_rl.utils.text import markdown
 
 __all__ = ["as_markdown", "read_tables", "summarise_flights"]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.statistics import (
+from modgnn_rl.evaluation.statistics import (
     interquartile_interval,
     interquartile_mean,
     paired_difference,

@@ -1,0 +1,1 @@
+"""Rollouts of policies, their metrics, and statistics over episodes."""
