@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
 
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.run_folder import RunFolder
 
 
 def smooth(values: np.ndarray, width: int) -> np.ndarray:

@@ -22,8 +22,8 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.deploy.export import export_agent
 from modgnn_rl.deploy.onnx_agent import OnnxAgent
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.loading import stored_world
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.loading import stored_world
+from modgnn_rl.tracking.run_folder import RunFolder
 
 
 @torch.no_grad()

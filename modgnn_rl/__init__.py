@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from modgnn_rl.deploy.agent import Agent
-    from modgnn_rl.loading import load_policy
     from modgnn_rl.models.registry import make_model, register_model
     from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
+    from modgnn_rl.tracking.loading import load_policy
 
 __version__ = "0.1.0"
 __all__ = ["Agent", "ModGNN", "ModGNNLayer", "__version__", "load_policy", "make_model", "register_model"]
@@ -22,7 +22,7 @@ _HOMES = {
     "Agent": "modgnn_rl.deploy.agent",
     "ModGNN": "modgnn_rl.nn.modgnn",
     "ModGNNLayer": "modgnn_rl.nn.modgnn",
-    "load_policy": "modgnn_rl.loading",
+    "load_policy": "modgnn_rl.tracking.loading",
     "make_model": "modgnn_rl.models",
     "register_model": "modgnn_rl.models",
 }

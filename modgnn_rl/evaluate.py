@@ -6,7 +6,7 @@ import shlex
 
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import EvaluateConfig, WorldChanges
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.run_folder import RunFolder
 
 
 def main(config: EvaluateConfig) -> None:

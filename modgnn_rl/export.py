@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import ExportConfig
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from modgnn_rl.deploy.export import Exported

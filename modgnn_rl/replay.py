@@ -9,7 +9,7 @@ from pathlib import Path
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import ReplayConfig, WorldChanges, as_list
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.run_folder import RunFolder
 
 PACKAGES = {"html": (), "mp4": ("av", "matplotlib"), "svg": ("matplotlib",), "png": ("matplotlib",)}
 EXTRAS = {"mp4": "video", "svg": "plots", "png": "plots"}

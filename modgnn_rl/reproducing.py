@@ -22,8 +22,8 @@ from modgnn_rl.configs.schema import (
 )
 from modgnn_rl.data.collect import collect
 from modgnn_rl.measuring import VALIDATION, flight_cell, fly_references, fly_subject, look_on, validate
-from modgnn_rl.run_folder import RunFolder
 from modgnn_rl.studies import Study, Subject, World
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.training import resume, train
 from modgnn_rl.utils.seeds import derive_seed
 

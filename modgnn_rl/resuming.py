@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, MAPPOConfig, TrainConfig
 from modgnn_rl.configs.settings import flat
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.run_folder import RunFolder
 
 __all__ = ["TRAINER_SETTINGS", "begins_anew", "changed_config", "differences", "stored_config", "with_stored_trainer"]
 

@@ -11,9 +11,9 @@ from typing import Any
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import RunsConfig, as_list
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_comparison import compare, differing_settings
-from modgnn_rl.run_list import list_runs, sort_key
-from modgnn_rl.run_summary import RunSummary, find_runs, summarise_run
+from modgnn_rl.tracking.comparison import compare, differing_settings
+from modgnn_rl.tracking.listing import list_runs, sort_key
+from modgnn_rl.tracking.summary import RunSummary, find_runs, summarise_run
 
 __all__ = ["find_run", "show_runs"]
 

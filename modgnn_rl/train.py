@@ -8,7 +8,7 @@ import sys
 from modgnn_rl.command import run_command, settings_given
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.resuming import TRAINER_SETTINGS, with_stored_trainer
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.run_folder import RunFolder
 
 
 def main(config: TrainConfig) -> None:

@@ -17,19 +17,19 @@ from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl import distributed
-from modgnn_rl.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
 from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.recording import Recorder, spacing
 from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation.rollout import evaluate
 from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_flights
-from modgnn_rl.loading import changed_world, load_policy
-from modgnn_rl.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.replay_page import write_replay
 from modgnn_rl.resuming import begins_anew, changed_config, differences, stored_config
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
+from modgnn_rl.tracking.loading import changed_world, load_policy
+from modgnn_rl.tracking.loggers import Dashboards, check_logger, make_logger
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.bc import bc
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.dagger import dagger

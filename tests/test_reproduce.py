@@ -14,7 +14,6 @@ from modgnn_rl.claims import CLAIMS, Claim, Side, claim_tables, judge
 from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig, ScaleConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
-from modgnn_rl.loading import load_policy
 from modgnn_rl.measuring import VALIDATION, Measurements
 from modgnn_rl.paper_tables import paper_tables, published
 from modgnn_rl.reproduce import claim_folder, main
@@ -22,6 +21,7 @@ from modgnn_rl.reproducing import cells_of
 from modgnn_rl.studies import Study, Subject, World, equal_hidden, study_of
 from modgnn_rl.study_pages import write_study
 from modgnn_rl.tabular import as_csv
+from modgnn_rl.tracking.loading import load_policy
 
 TINY = ScaleConfig(
     name="tiny", episodes=4, steps=30, held_out=2, updates=6, batch_size=4, flocks=2, flight_steps=8, sizes=[32],

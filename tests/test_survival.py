@@ -20,10 +20,10 @@ import pytest
 import torch
 
 from modgnn_rl import training
-from modgnn_rl.checkpoint import load_checkpoint, save_checkpoint
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, TrainConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import load_checkpoint, save_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.training import resume, train
 
 SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}

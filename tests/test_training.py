@@ -13,7 +13,6 @@ import yaml
 from tensordict import TensorDict
 
 from modgnn_rl import load_policy
-from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import (
     BCConfig,
@@ -27,7 +26,8 @@ from modgnn_rl.configs.schema import (
 )
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import load_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.train import main
 from modgnn_rl.trainers import watching
 from modgnn_rl.trainers.callbacks import Callback

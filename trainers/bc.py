@@ -12,12 +12,12 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import ReplayBuffer
 
 from modgnn_rl import distributed
-from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
 from modgnn_rl.data.dataset import FlightDataset
 from modgnn_rl.evaluation.rollout import fly
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import save_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.collection import Flocks, flocks_of_all_sizes, named_flocks, validation_flocks
 from modgnn_rl.trainers.journal import Journal
 from modgnn_rl.trainers.learner import Learner, fit_together, validate_together

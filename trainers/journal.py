@@ -16,10 +16,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from modgnn_rl import distributed
-from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.configs.schema import TrainerConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.tracking.checkpoint import save_checkpoint
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.collection import FlockCollector, Flocks
 from modgnn_rl.trainers.remote import RemoteFlights

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from modgnn_rl.checkpoint import Checkpoint
+from modgnn_rl.tracking.checkpoint import Checkpoint
 
 __all__ = ["Part", "Tensors", "gather", "scatter"]
 

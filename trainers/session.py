@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 from tensordict.nn import TensorDictModuleBase
 
-from modgnn_rl.checkpoint import Checkpoint
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.loggers import Dashboards
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import Checkpoint
+from modgnn_rl.tracking.loggers import Dashboards
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.utils.signals import Interruption
 

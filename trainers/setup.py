@@ -18,10 +18,10 @@ from modgnn_rl.configs.schema import (
 from modgnn_rl.data.dataset import FlightDataset
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
-from modgnn_rl.loading import load_policy, stored_model
 from modgnn_rl.models.registry import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.loading import load_policy, stored_model
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.collection import flocks_of, window_of
 from modgnn_rl.trainers.learner import Learner
 from modgnn_rl.trainers.ppo import improvement_window

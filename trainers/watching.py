@@ -13,9 +13,9 @@ from tensordict.nn import TensorDictModuleBase
 from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
 from modgnn_rl.errors import one_line
 from modgnn_rl.evaluation.rollout import Flights, fly, reference_policies
-from modgnn_rl.loggers import Dashboards
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.loggers import Dashboards
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.utils.seeds import derive_seed, seeded
 from modgnn_rl.videos import check_video, film, write_video

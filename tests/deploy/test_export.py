@@ -23,7 +23,6 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from modgnn_rl import Agent, ModGNN, ModGNNLayer, make_model
-from modgnn_rl.checkpoint import save_checkpoint
 from modgnn_rl.command import run_command
 from modgnn_rl.configs.schema import DAggerConfig, ExportConfig, ModelConfig, TrainConfig
 from modgnn_rl.deploy import export
@@ -34,7 +33,8 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.export import main
 from modgnn_rl.models.registry import MODELS
 from modgnn_rl.nn.communication import GraphAttention, MessagePassing
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import save_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 
 ROOT = Path(__file__).parents[2]
 NEIGHBOURS = (3, 0, 1, 2, 7, 40, 5)

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from modgnn_rl import make_model, training
-from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import (
     BCConfig,
     CollectConfig,
@@ -21,7 +20,8 @@ from modgnn_rl.configs.schema import (
 from modgnn_rl.data.collect import collect
 from modgnn_rl.data.dataset import FlightDataset, FlightWindows
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import load_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.learner import Learner
 from modgnn_rl.training import train
 

@@ -21,11 +21,11 @@ import torch
 import torch.distributed as dist
 
 from modgnn_rl import distributed, make_model, training
-from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError, NotFinite
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import load_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.collection import FlockCollector, Flocks

@@ -12,11 +12,11 @@ import torch
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from modgnn_rl import load_policy, training
-from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import fly
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import load_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.actor import GaussianActor
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.mappo import anchor_weight

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from modgnn_rl import load_policy, training
-from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import (
     BCConfig,
     CollectorConfig,
@@ -21,7 +20,8 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
 )
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import load_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.training import resume, train
 from modgnn_rl.utils.signals import Stopped

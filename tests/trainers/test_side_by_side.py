@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from modgnn_rl import load_policy, make_model, training
-from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import BCConfig, FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import load_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers import bc as trainer_module
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.trainers.collection import Flocks

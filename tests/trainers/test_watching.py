@@ -17,10 +17,10 @@ from modgnn_rl.configs.schema import (
     ModelConfig,
     TrainConfig,
 )
-from modgnn_rl.dashboards import Dashboard
 from modgnn_rl.evaluation.rollout import fly, reference_policies
-from modgnn_rl.loggers import Dashboards
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.backends import Dashboard
+from modgnn_rl.tracking.loggers import Dashboards
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers import watching
 from modgnn_rl.trainers.watching import Watch, log_evaluation
 from modgnn_rl.training import train

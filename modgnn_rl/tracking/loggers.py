@@ -14,9 +14,9 @@ from typing import Any
 import torch
 
 from modgnn_rl.configs.schema import TrainConfig, as_list
-from modgnn_rl.dashboards import CsvFiles, Dashboard, Tensorboard, Wandb
 from modgnn_rl.errors import InputError, one_line
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.backends import CsvFiles, Dashboard, Tensorboard, Wandb
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.provenance import made_with
 
 __all__ = ["Dashboards", "check_logger", "make_logger"]

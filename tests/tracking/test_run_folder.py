@@ -12,9 +12,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modgnn_rl import run_folder
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking import run_folder
+from modgnn_rl.tracking.run_folder import RunFolder
 
 CONFIG = "env:\n  comm_range: 3.5\n  num_agents: [8, 16]\nlr: 1.0e-05\nname: null\n"
 

@@ -210,7 +210,7 @@ class RunFolder:
 
     @property
     def checkpoints(self) -> Path:
-        """The folder for :func:`modgnn_rl.checkpoint.save_checkpoint`."""
+        """The folder for :func:`modgnn_rl.tracking.checkpoint.save_checkpoint`."""
         return self.path / "checkpoints"
 
     @property

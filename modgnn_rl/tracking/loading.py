@@ -10,13 +10,13 @@ import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from modgnn_rl.checkpoint import load_checkpoint
 from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.registry import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.checkpoint import load_checkpoint
+from modgnn_rl.tracking.run_folder import RunFolder
 
 __all__ = ["changed_world", "load_policy", "stored_model", "stored_world"]
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from modgnn_rl.configs.schema import as_list
-from modgnn_rl.run_files import (
+from modgnn_rl.tracking.reader import (
     as_dict,
     as_number,
     as_time,
@@ -23,7 +23,7 @@ from modgnn_rl.run_files import (
     read_evaluation,
     written_at,
 )
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.run_folder import RunFolder
 
 __all__ = ["METRICS", "RunSummary", "find_runs", "summarise_run"]
 
@@ -43,7 +43,7 @@ class RunSummary:
         run: the folder of the run, which for one of several policies is another.
         problem: what could not be read; empty where all could.
         config: the settings; empty where they cannot be read.
-        state: as `modgnn_rl.run_folder.RunFolder.state`; ``unreadable`` without settings.
+        state: as `modgnn_rl.tracking.run_folder.RunFolder.state`; ``unreadable`` without settings.
         reason: why it ended before its time.
         started, updated: when it began, and when it was last heard of.
         seconds: how long it has trained, s; if it does not train any more, until its last checkpoint.

@@ -1,6 +1,6 @@
 """Dashboards: what TensorBoard, Weights & Biases and CSV files each make of a run, on TorchRL's loggers.
 
-They may fail and may keep one waiting; `modgnn_rl.loggers.Dashboards` guards against both.
+They may fail and may keep one waiting; `modgnn_rl.tracking.loggers.Dashboards` guards against both.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torchrl.record import CSVLogger, TensorboardLogger, WandbLogger
 from modgnn_rl.configs.schema import WandbConfig
 from modgnn_rl.configs.settings import flat
 from modgnn_rl.errors import one_line
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.run_folder import RunFolder
 
 __all__ = ["CsvFiles", "Dashboard", "Tensorboard", "Wandb"]
 

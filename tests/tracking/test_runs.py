@@ -15,15 +15,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from modgnn_rl import run_files
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, MAPPOConfig, RunsConfig, TrainConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_comparison import compare, differing_settings
-from modgnn_rl.run_files import last_records
-from modgnn_rl.run_folder import RunFolder
-from modgnn_rl.run_list import list_runs
-from modgnn_rl.run_summary import find_runs, summarise_run
 from modgnn_rl.runs import find_run, show_runs
+from modgnn_rl.tracking import reader
+from modgnn_rl.tracking.comparison import compare, differing_settings
+from modgnn_rl.tracking.listing import list_runs
+from modgnn_rl.tracking.reader import last_records
+from modgnn_rl.tracking.run_folder import RunFolder
+from modgnn_rl.tracking.summary import find_runs, summarise_run
 
 YAML: dict[str, str] = {}
 ERRORS = [0.9, 0.8, 0.4, 0.3, 0.2, 0.1]
@@ -85,7 +85,7 @@ def test_the_last_lines_are_those_of_the_whole_file(tmp_path_factory, lengths, c
     records = [{"step": step, "text": "x" * length} for step, length in enumerate(lengths)]
     file.write_text("".join(json.dumps(record) + "\n" for record in records) + ('{"step": 99' if cut else ""))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_files, "BLOCK", block)
+        patch.setattr(reader, "BLOCK", block)
         assert last_records(file, count) == records[-count:]
 
 

@@ -9,9 +9,9 @@ from typing import Any
 
 from modgnn_rl.configs.settings import flat
 from modgnn_rl.errors import InputError
-from modgnn_rl.run_files import EVALUATED, SHARES
-from modgnn_rl.run_list import next_steps, state_of
-from modgnn_rl.run_summary import METRICS, RunSummary
+from modgnn_rl.tracking.listing import next_steps, state_of
+from modgnn_rl.tracking.reader import EVALUATED, SHARES
+from modgnn_rl.tracking.summary import METRICS, RunSummary
 from modgnn_rl.utils.text import as_figure, as_span, markdown
 
 __all__ = ["compare", "differing_settings"]

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from modgnn_rl.run_folder import SCHEMA_VERSION
+from modgnn_rl.tracking.run_folder import SCHEMA_VERSION
 
 __all__ = [
     "EVALUATED",

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable, Collection, Sequence
 from datetime import datetime
 
-from modgnn_rl.run_summary import METRICS, RunSummary
+from modgnn_rl.tracking.summary import METRICS, RunSummary
 from modgnn_rl.utils.text import aligned, as_figure, as_span, markdown, printable
 
 __all__ = ["list_runs", "next_steps", "sort_key", "state_of"]

@@ -22,10 +22,10 @@ import torch
 from modgnn_rl import training
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig, WandbConfig
 from modgnn_rl.configs.settings import check
-from modgnn_rl.dashboards import Dashboard
 from modgnn_rl.errors import InputError
-from modgnn_rl.loggers import Dashboards, check_logger, make_logger
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.backends import Dashboard
+from modgnn_rl.tracking.loggers import Dashboards, check_logger, make_logger
+from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.callbacks import Callback
 
 
@@ -319,7 +319,7 @@ def wandb_helpers():
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
 @pytest.mark.usefixtures("clean_wandb")
 def test_wandb_without_its_helper_is_off_with_one_warning_and_does_not_harm_the_next_run(run, monkeypatch, sent):
-    monkeypatch.setattr("modgnn_rl.loggers.PATIENCE", 1.5)
+    monkeypatch.setattr("modgnn_rl.tracking.loggers.PATIENCE", 1.5)
     logger = make_logger(config("wandb"), run)
     helpers = wandb_helpers()
     assert helpers
@@ -383,8 +383,8 @@ ON_A_TERMINAL = """
 import pathlib, sys, warnings
 from modgnn_rl import training
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig, WandbConfig
-from modgnn_rl.loggers import make_logger
-from modgnn_rl.run_folder import RunFolder
+from modgnn_rl.tracking.loggers import make_logger
+from modgnn_rl.tracking.run_folder import RunFolder
 
 assert sys.stdin.isatty() and sys.stdout.isatty()
 run = RunFolder.open(sys.argv[1])

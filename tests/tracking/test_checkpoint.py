@@ -14,8 +14,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modgnn_rl.checkpoint import load_checkpoint, save_checkpoint
 from modgnn_rl.errors import InputError
+from modgnn_rl.tracking.checkpoint import load_checkpoint, save_checkpoint
 from modgnn_rl.utils.files import sha256
 
 FILES = ["manifest.json", "optimizer.safetensors", "policy.safetensors", "state.json"]

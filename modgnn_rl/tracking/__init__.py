@@ -1,0 +1,1 @@
+"""Run folders, checkpoints, loggers, and what lists and compares runs."""
