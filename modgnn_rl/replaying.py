@@ -15,11 +15,11 @@ from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.recording import Recorder, Recording, spacing
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import fly, reference_policies
-from modgnn_rl.replay_page import write_replay
 from modgnn_rl.tracking.loading import changed_world, load_policy
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.training import prepare_torch
 from modgnn_rl.utils.progress import Progress
+from modgnn_rl.visualization.html import write_replay
 
 __all__ = ["record", "replay_run"]
 
@@ -48,7 +48,7 @@ def replay_run(config: ReplayConfig) -> Path:
     }  # fmt: skip
     try:
         if config.format == "mp4":
-            from modgnn_rl.videos import film, write_video
+            from modgnn_rl.visualization.video import film, write_video
 
             write_video(path, film(policy, world, **flight), world.control_frequency)
             return path
@@ -61,7 +61,7 @@ def replay_run(config: ReplayConfig) -> Path:
         facts = {"run": run.path.name, "flown": f"{agents} agents, {config.steps} steps, seed {config.seed}"}
         facts |= {"checkpoint": config.checkpoint} | {f"env.{key}": value for key, value in changes.items()}
         if still:
-            from modgnn_rl.replay_picture import write_picture
+            from modgnn_rl.visualization.picture import write_picture
 
             write_picture(path, recordings, shown)
         else:
@@ -103,7 +103,7 @@ def _fly_all(
             progress.update(flying=name)
             viewer = None
             if config.viewer and not recordings:
-                from modgnn_rl.replay_viewer import Viewer
+                from modgnn_rl.visualization.viewer import Viewer
 
                 viewer = stack.enter_context(Viewer(world, config.port))
             recordings[name] = record(policy, world, every=every, progress=progress, watch=viewer, **flight)
@@ -123,7 +123,7 @@ def record(
     watch: Callable[[TensorDictBase], None] | None = None,
     expert: TensorDictModuleBase | None = None,
 ) -> Recording:
-    """Fly one flock with a policy and keep what it looks like, for `modgnn_rl.replay_page.write_replay`.
+    """Fly one flock with a policy and keep what it looks like, for `modgnn_rl.visualization.html.write_replay`.
 
     Args:
         policy: as `modgnn_rl.evaluation.rollout.fly` flies it.

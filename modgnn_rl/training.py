@@ -24,7 +24,6 @@ from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation.rollout import evaluate
 from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_flights
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.replay_page import write_replay
 from modgnn_rl.resuming import begins_anew, changed_config, differences, stored_config
 from modgnn_rl.tracking.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.tracking.loading import changed_world, load_policy
@@ -38,6 +37,7 @@ from modgnn_rl.trainers.session import Session
 from modgnn_rl.trainers.setup import check_training, settle_model
 from modgnn_rl.trainers.watching import Watch, log_evaluation
 from modgnn_rl.utils.signals import Interruption
+from modgnn_rl.visualization.html import write_replay
 
 __all__ = ["TRAINERS", "evaluate_policies", "evaluate_run", "prepare_torch", "resume", "train"]
 

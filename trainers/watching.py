@@ -18,7 +18,7 @@ from modgnn_rl.tracking.loggers import Dashboards
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.callbacks import Callback
 from modgnn_rl.utils.seeds import derive_seed, seeded
-from modgnn_rl.videos import check_video, film, write_video
+from modgnn_rl.visualization.video import check_video, film, write_video
 
 __all__ = ["Watch", "log_evaluation"]
 

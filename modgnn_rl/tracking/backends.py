@@ -112,7 +112,7 @@ class Tensorboard(Dashboard):
         """Show a film among the images, as a GIF, the only form of film that there is."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
-        from modgnn_rl.videos import as_gif
+        from modgnn_rl.visualization.video import as_gif
 
         gif, width, height = as_gif(path)
         image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from modgnn_rl import load_policy, training, videos
+from modgnn_rl import load_policy, training
 from modgnn_rl.configs.schema import (
     BCConfig,
     DAggerConfig,
@@ -24,6 +24,7 @@ from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers import watching
 from modgnn_rl.trainers.watching import Watch, log_evaluation
 from modgnn_rl.training import train
+from modgnn_rl.visualization import video
 
 TRAINERS = {
     "bc": BCConfig(num_envs=1, batch_size=16, cloning_steps=8, cloning_updates=4, held_out=2),
@@ -221,7 +222,7 @@ def test_what_fails_is_left_out_with_one_warning(watch, monkeypatch):
 
 
 def test_missing_packages_are_said_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(videos.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
     watch = Watch(_config(tmp_path), None, Dashboards({"recorder": Recorder}))
 
     def use():

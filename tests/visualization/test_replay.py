@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modgnn_rl import replay_page
 from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig
 from modgnn_rl.envs.flocking.expert import as_matrix
 from modgnn_rl.envs.flocking.recording import METRICS, QUANTUM, Recorder, Recording, spacing
@@ -20,6 +19,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import fly, reference_policies
 from modgnn_rl.replay import refuse
 from modgnn_rl.replaying import record
+from modgnn_rl.visualization import html
 
 sys.path.insert(0, str(Path(__file__).parent))
 browser = importlib.import_module("browser")
@@ -62,7 +62,7 @@ def test_some_of_the_steps_are_kept():
 
 
 def _unpack(data, agents, steps):
-    """What `replay_page.pack` was given, by the words of its docstring."""
+    """What `html.pack` was given, by the words of its docstring."""
     raw, place = gzip.decompress(data), 0
 
     def planes(count, integrations):
@@ -112,9 +112,9 @@ def test_packing_loses_nothing(agents):
         max_speed=0.92,
         frequency=48.0,
     )
-    position, velocity, present, metrics, flips = _unpack(replay_page.pack(recording), agents, steps)
+    position, velocity, present, metrics, flips = _unpack(html.pack(recording), agents, steps)
     assert np.array_equal(position, recording.position)
-    assert np.abs(velocity * 0.92 / replay_page.VELOCITY_STEPS - recording.target_velocity).max() < 0.0037
+    assert np.abs(velocity * 0.92 / html.VELOCITY_STEPS - recording.target_velocity).max() < 0.0037
     assert np.array_equal(present, recording.present)
     assert np.array_equal(metrics, np.stack([recording.metrics[name] for name in METRICS]).astype("f4"))
     assert all(np.array_equal(one, other) for one, other in zip(flips, recording.flips, strict=True))
@@ -123,7 +123,7 @@ def test_packing_loses_nothing(agents):
 def _page(tmp_path, world=FAULTY, names=("expert", "zero action"), title="a </script> title", **flight):
     recordings = {name: _record(world, name=name, **flight)[0] for name in names}
     path = tmp_path / "replay.html"
-    replay_page.write_replay(path, recordings, title, {"seed": 5})
+    html.write_replay(path, recordings, title, {"seed": 5})
     return path
 
 
@@ -140,7 +140,7 @@ def test_two_flights_of_32_agents_and_1000_steps_take_less_than_a_megabyte(tmp_p
     world, names = FlockingConfig(), ("expert", "LocalReynolds(hops=1)")
     policies = reference_policies(world)
     flights = {name: record(policies[name], world, num_agents=32, steps=1000, seed=5) for name in names}
-    replay_page.write_replay(tmp_path / "replay.html", flights, "two flights")
+    html.write_replay(tmp_path / "replay.html", flights, "two flights")
     assert (tmp_path / "replay.html").stat().st_size < 1_000_000
 
 
@@ -163,7 +163,7 @@ def test_what_cannot_be_done_is_said_in_one_sentence(tmp_path):
 
 def test_a_picture_is_the_same_each_time(tmp_path):
     pytest.importorskip("matplotlib")
-    from modgnn_rl.replay_picture import write_picture
+    from modgnn_rl.visualization.picture import write_picture
 
     recording, _ = _record(FAULTY, steps=4)
     for name in ("a.svg", "b.svg"):

@@ -12,7 +12,7 @@ import torch
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.videos import Frame, as_gif, film, write_video
+from modgnn_rl.visualization.video import Frame, as_gif, film, write_video
 
 
 def _frames(world, steps=12, agents=5):

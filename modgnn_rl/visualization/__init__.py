@@ -1,0 +1,1 @@
+"""Replays, images and videos of rollouts."""
