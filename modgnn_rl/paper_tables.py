@@ -13,8 +13,8 @@ import yaml
 
 from modgnn_rl.evaluation.statistics import Interval, interquartile_interval
 from modgnn_rl.measuring import VALIDATION, Measurements
+from modgnn_rl.reporting.table import Table
 from modgnn_rl.studies import Subject
-from modgnn_rl.tabular import Table
 
 __all__ = ["REFERENCES", "mean", "middle", "name_of", "paper_tables", "published", "shown", "spread", "title_of"]
 

@@ -16,11 +16,11 @@ from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.measuring import VALIDATION, Measurements
 from modgnn_rl.paper_tables import paper_tables, published
+from modgnn_rl.reporting.table import as_csv
 from modgnn_rl.reproduce import claim_folder, main
 from modgnn_rl.reproducing import cells_of
 from modgnn_rl.studies import Study, Subject, World, equal_hidden, study_of
 from modgnn_rl.study_pages import write_study
-from modgnn_rl.tabular import as_csv
 from modgnn_rl.tracking.loading import load_policy
 
 TINY = ScaleConfig(

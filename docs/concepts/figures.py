@@ -26,11 +26,11 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, load_policy, make_model
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, EvaluationConfig, FlockingConfig, ModelConfig, TrainConfig
-from modgnn_rl.drawing import GRID, INK, PAPER, draw, styles_of
 from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
 from modgnn_rl.envs.flocking.metrics import action_error, is_lost
 from modgnn_rl.evaluation.rollout import endless_env
-from modgnn_rl.plots import Curve, draw_curves, draw_panels
+from modgnn_rl.reporting.figure import GRID, INK, PAPER, draw, styles_of
+from modgnn_rl.reporting.plots import Curve, draw_curves, draw_panels
 from modgnn_rl.training import train
 from modgnn_rl.utils.seeds import seeded
 

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.tabular import Table, as_csv, as_latex, as_markdown, first_number, latex_escape, numeric_columns
+from modgnn_rl.reporting.table import Table, as_csv, as_latex, as_markdown, first_number, latex_escape, numeric_columns
 
 ROWS: list[list[str | float]] = [
     ["expert", "-", 0.0, "3.55 ± 3.96"],

@@ -11,11 +11,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from modgnn_rl import drawing, report
-from modgnn_rl.drawing import styles_of
 from modgnn_rl.errors import InputError
-from modgnn_rl.plots import Curve, Estimate, _kept_apart, draw_curves, draw_intervals, draw_panels
-from modgnn_rl.report import Details, Figure, Provenance, Section, Table, write_report
+from modgnn_rl.reporting import figure, report
+from modgnn_rl.reporting.figure import styles_of
+from modgnn_rl.reporting.plots import Curve, Estimate, _kept_apart, draw_curves, draw_intervals, draw_panels
+from modgnn_rl.reporting.report import Details, Figure, Provenance, Section, Table, write_report
 
 EVIL = "<script>alert(\"1\")</script> & 'x' $title"
 PROVENANCE = Provenance(
@@ -186,10 +186,10 @@ def test_colours_stand_out_from_the_page():
         low, high = sorted((luminance(one), luminance(other)))
         return (high + 0.05) / (low + 0.05)
 
-    for light, dark in drawing._SERIES.items():
-        assert min(contrast(light, drawing.PAPER), contrast(dark, drawing._DARK[drawing.PAPER])) >= 3
-    for ink in (drawing.INK, drawing.MUTED):
-        assert min(contrast(ink, drawing.PAPER), contrast(drawing._DARK[ink], drawing._DARK[drawing.PAPER])) >= 4.5
+    for light, dark in figure._SERIES.items():
+        assert min(contrast(light, figure.PAPER), contrast(dark, figure._DARK[figure.PAPER])) >= 3
+    for ink in (figure.INK, figure.MUTED):
+        assert min(contrast(ink, figure.PAPER), contrast(figure._DARK[ink], figure._DARK[figure.PAPER])) >= 4.5
 
 
 def test_labels_are_kept_apart_in_order_and_inside():

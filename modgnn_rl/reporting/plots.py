@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from modgnn_rl.drawing import INK, MUTED, PAPER, styles_of
+from modgnn_rl.reporting.figure import INK, MUTED, PAPER, styles_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +79,7 @@ def draw_curves(
 
     Args:
         figure: an empty figure.
-        curves: by name; a model always has the same colour, see `modgnn_rl.drawing.styles_of`.
+        curves: by name; a model always has the same colour, see `modgnn_rl.reporting.figure.styles_of`.
         x_label: with its unit.
         y_label: with its unit.
         references: heights of horizontal lines by name, such as ``{"expert": 0.0}``; a logarithmic axis leaves out what

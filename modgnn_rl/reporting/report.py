@@ -11,9 +11,9 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING
 
-from modgnn_rl.drawing import Drawing, can_draw, draw, page_colours
 from modgnn_rl.errors import InputError
-from modgnn_rl.tabular import Table, numeric_columns, slug
+from modgnn_rl.reporting.figure import Drawing, can_draw, draw, page_colours
+from modgnn_rl.reporting.table import Table, numeric_columns, slug
 from modgnn_rl.utils.files import write_atomically
 from modgnn_rl.utils.provenance import Provenance, gather_provenance
 
@@ -35,7 +35,7 @@ class Figure:
 
     Attributes:
         name: name of its files ``figures/<name>.svg`` and ``.png``: letters, digits and ``_ . + -``; used once.
-        draw: draws onto an empty matplotlib figure, see `modgnn_rl.plots`. It is called twice, with a wide figure for
+        draw: draws onto an empty matplotlib figure, see `modgnn_rl.reporting.plots`. It is called twice, with a wide figure for
             the page and for papers and with a narrow one for phones.
         caption: what is to be seen; screen readers read it in place of the figure.
     """
