@@ -34,11 +34,11 @@ def main(config: ReproduceConfig) -> int:
         )
     recordable(config.env, config.scale.steps)
     folder = claim_folder(config)
-    from modgnn_rl.cells import run_cells
-    from modgnn_rl.measuring import Measurements
-    from modgnn_rl.reproducing import cells_of
-    from modgnn_rl.studies import study_of
-    from modgnn_rl.study_pages import write_study
+    from modgnn_rl.reproduction.measurements import Measurements
+    from modgnn_rl.reproduction.pages import write_study
+    from modgnn_rl.reproduction.pipeline import cells_of
+    from modgnn_rl.reproduction.studies import study_of
+    from modgnn_rl.reproduction.tasks import run_cells
     from modgnn_rl.training import prepare_torch
 
     prepare_torch(config.device, config.threads)

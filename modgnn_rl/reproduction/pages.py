@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from omegaconf import OmegaConf
 
-from modgnn_rl.claims import claim_tables
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig
-from modgnn_rl.measuring import VALIDATION, Measurements
-from modgnn_rl.paper_tables import REFERENCES, middle, name_of, paper_tables, shown, title_of
 from modgnn_rl.reporting.plots import Curve, Estimate, draw_curves, draw_intervals
 from modgnn_rl.reporting.report import Details, Figure, Section, gather_provenance, write_report
 from modgnn_rl.reporting.table import Table, as_csv, as_latex, as_markdown
-from modgnn_rl.studies import FAULTS, HOPS, Subject, World, fault_name
+from modgnn_rl.reproduction.claims import claim_tables
+from modgnn_rl.reproduction.measurements import VALIDATION, Measurements
+from modgnn_rl.reproduction.paper_tables import REFERENCES, middle, name_of, paper_tables, shown, title_of
+from modgnn_rl.reproduction.studies import FAULTS, HOPS, Subject, World, fault_name
 from modgnn_rl.utils.files import write_atomically
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ import threading
 
 import pytest
 
-from modgnn_rl import cells
-from modgnn_rl.cells import Cell, run_cells
+from modgnn_rl.reproduction import tasks
+from modgnn_rl.reproduction.tasks import Cell, run_cells
 
 
 def counting(calls, name, result=None, needs=()):
@@ -126,7 +126,7 @@ def test_interruption_keeps_what_is_done(tmp_path):
 
 def test_the_time_before_an_interruption_counts(tmp_path, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(cells.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(tasks.time, "monotonic", lambda: now[0])
 
     def interrupted(done):
         now[0] += 5.0
@@ -144,7 +144,7 @@ def test_the_time_before_an_interruption_counts(tmp_path, monkeypatch):
 
 
 def test_two_that_work_in_one_folder_share_the_cells(tmp_path, monkeypatch):
-    monkeypatch.setattr(cells, "WAIT", 0.01)
+    monkeypatch.setattr(tasks, "WAIT", 0.01)
     calls, busy = [], threading.Event()
     last = threading.Event()
 
@@ -173,7 +173,7 @@ def test_two_that_work_in_one_folder_share_the_cells(tmp_path, monkeypatch):
 
 def test_progress_tells_the_time_left(tmp_path, capsys, monkeypatch):
     now = iter([0.0, *(10.0 * number for number in range(40))])
-    monkeypatch.setattr(cells.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(tasks.time, "monotonic", lambda: next(now))
     run_cells(tmp_path, [Cell("a", lambda done: {}, cost=1.0), Cell("b", lambda done: {}, cost=3.0)])
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "[1/2]: a"

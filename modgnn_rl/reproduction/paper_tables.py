@@ -12,9 +12,9 @@ import numpy as np
 import yaml
 
 from modgnn_rl.evaluation.statistics import Interval, interquartile_interval
-from modgnn_rl.measuring import VALIDATION, Measurements
 from modgnn_rl.reporting.table import Table
-from modgnn_rl.studies import Subject
+from modgnn_rl.reproduction.measurements import VALIDATION, Measurements
+from modgnn_rl.reproduction.studies import Subject
 
 __all__ = ["REFERENCES", "mean", "middle", "name_of", "paper_tables", "published", "shown", "spread", "title_of"]
 

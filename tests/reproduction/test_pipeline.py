@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from modgnn_rl.cells import Outcome, run_cells
-from modgnn_rl.claims import CLAIMS, Claim, Side, claim_tables, judge
 from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig, ScaleConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
-from modgnn_rl.measuring import VALIDATION, Measurements
-from modgnn_rl.paper_tables import paper_tables, published
 from modgnn_rl.reporting.table import as_csv
 from modgnn_rl.reproduce import claim_folder, main
-from modgnn_rl.reproducing import cells_of
-from modgnn_rl.studies import Study, Subject, World, equal_hidden, study_of
-from modgnn_rl.study_pages import write_study
+from modgnn_rl.reproduction.claims import CLAIMS, Claim, Side, claim_tables, judge
+from modgnn_rl.reproduction.measurements import VALIDATION, Measurements
+from modgnn_rl.reproduction.pages import write_study
+from modgnn_rl.reproduction.paper_tables import paper_tables, published
+from modgnn_rl.reproduction.pipeline import cells_of
+from modgnn_rl.reproduction.studies import Study, Subject, World, equal_hidden, study_of
+from modgnn_rl.reproduction.tasks import Outcome, run_cells
 from modgnn_rl.tracking.loading import load_policy
 
 TINY = ScaleConfig(

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
-from modgnn_rl.cells import Outcome, Result
 from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig
 from modgnn_rl.data.dataset import FlightDataset
 from modgnn_rl.envs.flocking.expert import LocalReynolds
 from modgnn_rl.envs.flocking.metrics import action_error
 from modgnn_rl.evaluation.rollout import Flights, fly, reference_policies
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.studies import Study, Subject, World
+from modgnn_rl.reproduction.studies import Study, Subject, World
+from modgnn_rl.reproduction.tasks import Outcome, Result
 from modgnn_rl.tracking.loading import load_policy
 from modgnn_rl.trainers.imitation import imitation_loss
 from modgnn_rl.utils.progress import Progress

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modgnn_rl.evaluation.statistics import Interval, probability_of_improvement
-from modgnn_rl.measuring import VALIDATION, Measurements
-from modgnn_rl.paper_tables import NAMES, mean, published, shown, spread
 from modgnn_rl.reporting.table import Table
-from modgnn_rl.studies import HOPS, Subject
+from modgnn_rl.reproduction.measurements import VALIDATION, Measurements
+from modgnn_rl.reproduction.paper_tables import NAMES, mean, published, shown, spread
+from modgnn_rl.reproduction.studies import HOPS, Subject
 
 __all__ = ["CLAIMS", "Claim", "Side", "claim_tables", "judge"]
 
