@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from modgnn_rl.command import run_command
+from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.resuming import TRAINER_SETTINGS
 

@@ -1,7 +1,7 @@
 """The pages that are made from the configuration itself: every command, every choice, every setting.
 
 ``docs/conf.py`` calls `write_reference` whenever the site is built. A command is whatever has a YAML file at the top of
-``configs/``; what it is made of is what it declares to `modgnn_rl.command.run_command`.
+``configs/``; what it is made of is what it declares to `modgnn_rl.cli.command.run_command`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import yaml
 from omegaconf import MISSING
 
 import modgnn_rl
-from modgnn_rl.command_help import FLAGS, legal_values
+from modgnn_rl.cli.help import FLAGS, legal_values
 
 PACKAGE = Path(modgnn_rl.__file__).parent
 CONFIGS = PACKAGE / "configs"
@@ -67,7 +67,7 @@ def commands() -> list[Command]:
         found.append(Command(name, main, schema, nodes or {}))
 
     for file in sorted(CONFIGS.glob("*.yaml")):
-        with mock.patch("modgnn_rl.command.run_command", declare), mock.patch.object(sys, "argv", [file.stem]):
+        with mock.patch("modgnn_rl.cli.command.run_command", declare), mock.patch.object(sys, "argv", [file.stem]):
             runpy.run_path(str(PACKAGE / f"{file.stem}.py"), run_name="__main__")
     return found
 

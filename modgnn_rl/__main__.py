@@ -6,9 +6,9 @@ import argparse
 import sys
 
 import modgnn_rl
+from modgnn_rl.cli.overview import commands, completion, overview
 from modgnn_rl.configs.settings import suggestion
 from modgnn_rl.errors import InputError
-from modgnn_rl.overview import commands, completion, overview
 
 
 def main(arguments: list[str]) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from modgnn_rl.command import run_command
+from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import CollectConfig
 
 

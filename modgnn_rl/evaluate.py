@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 
-from modgnn_rl.command import run_command
+from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import EvaluateConfig, WorldChanges
 from modgnn_rl.tracking.run_folder import RunFolder
 

@@ -7,7 +7,7 @@ import time
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from modgnn_rl.command import run_command
+from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import ExportConfig
 from modgnn_rl.tracking.run_folder import RunFolder
 

@@ -6,7 +6,7 @@ import importlib.util
 import shlex
 from pathlib import Path
 
-from modgnn_rl.command import run_command
+from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import ReplayConfig, WorldChanges, as_list
 from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.run_folder import RunFolder

@@ -10,7 +10,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from modgnn_rl.command import run_command
+from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig
 from modgnn_rl.configs.settings import flat
 from modgnn_rl.data.manifest import recordable

@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from modgnn_rl.command import run_command
+from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import RunsConfig, as_list
 from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.comparison import compare, differing_settings

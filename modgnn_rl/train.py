@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 
-from modgnn_rl.command import run_command, settings_given
+from modgnn_rl.cli.command import run_command, settings_given
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.resuming import TRAINER_SETTINGS, with_stored_trainer
 from modgnn_rl.tracking.run_folder import RunFolder

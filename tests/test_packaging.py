@@ -111,7 +111,7 @@ def test_version_is_a_literal_that_setuptools_can_read() -> None:
 
 
 def test_importing_the_package_and_its_settings_does_not_load_torch() -> None:
-    code = "import sys, modgnn_rl, modgnn_rl.command, modgnn_rl.configs.schema; print('torch' in sys.modules)"
+    code = "import sys, modgnn_rl, modgnn_rl.cli.command, modgnn_rl.configs.schema; print('torch' in sys.modules)"
     process = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert (process.stdout, process.stderr) == ("False\n", "")
 

@@ -13,7 +13,7 @@ import yaml
 from tensordict import TensorDict
 
 from modgnn_rl import load_policy
-from modgnn_rl.command import run_command
+from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import (
     BCConfig,
     DAggerConfig,

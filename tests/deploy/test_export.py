@@ -23,7 +23,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from modgnn_rl import Agent, ModGNN, ModGNNLayer, make_model
-from modgnn_rl.command import run_command
+from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import DAggerConfig, ExportConfig, ModelConfig, TrainConfig
 from modgnn_rl.deploy import export
 from modgnn_rl.deploy.agent import LinkData

@@ -323,7 +323,7 @@ def test_what_would_move_the_cursor_is_not_printed(tmp_path):
 
 def command(*arguments, **options):
     """Run the command, without torch."""
-    code = "import sys; sys.modules['torch'] = None; from modgnn_rl.command import run_command as run; "
+    code = "import sys; sys.modules['torch'] = None; from modgnn_rl.cli.command import run_command as run; "
     code += "from modgnn_rl.runs import main, RunsConfig; run(main, RunsConfig, 'runs')"
     return subprocess.Popen([sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True, **options)
 

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from modgnn_rl.command import run_command, settings_given
+from modgnn_rl.cli.command import run_command, settings_given
+from modgnn_rl.cli.overview import completion
 from modgnn_rl.configs.settings import setting
 from modgnn_rl.errors import InputError
-from modgnn_rl.overview import completion
 from modgnn_rl.utils.signals import Stopped
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @dataclass
@@ -343,7 +343,7 @@ def test_an_error_is_reported_at_once_without_torch(tmp_path: Path) -> None:
         textwrap.dedent("""\
             import atexit, pathlib, sys
             from dataclasses import dataclass
-            from modgnn_rl.command import run_command
+            from modgnn_rl.cli.command import run_command
 
             @dataclass
             class Toy:

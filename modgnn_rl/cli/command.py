@@ -49,10 +49,10 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from modgnn_rl.command_help import children, fields, help_text
+from modgnn_rl.cli.help import children, fields, help_text
+from modgnn_rl.cli.overview import completion
 from modgnn_rl.configs.settings import check, suggestion
 from modgnn_rl.errors import InputError
-from modgnn_rl.overview import completion
 from modgnn_rl.utils.signals import Stopped
 
 __all__ = ["run_command", "settings_given"]

@@ -13,9 +13,9 @@ import pytest
 
 import modgnn_rl
 from modgnn_rl.__main__ import main
-from modgnn_rl.overview import FIRST, commands, completion, overview
+from modgnn_rl.cli.overview import FIRST, commands, completion, overview
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 NAMES = {path.stem for path in (ROOT / "configs").glob("*.yaml")}  # each command has a file there
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
 
