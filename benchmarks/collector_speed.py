@@ -18,8 +18,8 @@ from importlib.metadata import version
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collection import FlockCollector
-from modgnn_rl.trainers.remote import RemoteFlights
+from modgnn_rl.trainers.collectors.flocks import FlockCollector
+from modgnn_rl.trainers.collectors.remote import RemoteFlights
 from modgnn_rl.training import prepare_torch
 
 FLOCKS, AGENTS, STEPS, WORKERS = 32, 32, 40, 2

@@ -20,9 +20,9 @@ from torchrl.data import ReplayBuffer
 from modgnn_rl import ModGNN, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collection import Flocks
-from modgnn_rl.trainers.imitation import imitation_loss, stacked_losses
-from modgnn_rl.trainers.learner import Learner
+from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.imitation.learner import Learner
+from modgnn_rl.trainers.imitation.loss import imitation_loss, stacked_losses
 from modgnn_rl.training import prepare_torch
 
 REPETITIONS = 9

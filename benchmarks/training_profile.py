@@ -65,11 +65,11 @@ def watched() -> Clock:
     from modgnn_rl.envs import FlockingEnv
     from modgnn_rl.envs.flocking.expert import Reynolds
     from modgnn_rl.nn.modgnn import ModGNN
-    from modgnn_rl.trainers import learner
-    from modgnn_rl.trainers.collection import FlockCollector, Flocks
-    from modgnn_rl.trainers.journal import Journal
-    from modgnn_rl.trainers.stepping import Stepper
-    from modgnn_rl.trainers.watching import Watch
+    from modgnn_rl.trainers.collectors.flocks import FlockCollector, Flocks
+    from modgnn_rl.trainers.common.optimization import Stepper
+    from modgnn_rl.trainers.imitation.loss import learner
+    from modgnn_rl.trainers.loop.dashboard_callback import Watch
+    from modgnn_rl.trainers.loop.training_loop import Journal
 
     clock = Clock()
     clock.watch(FlockingEnv, "_step", "environment: physics and graph")

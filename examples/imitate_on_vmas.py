@@ -26,9 +26,9 @@ from torchrl.modules import get_primers_from_module
 
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.models.equivariant import mlp
-from modgnn_rl.trainers.collection import as_windows
-from modgnn_rl.trainers.imitation import imitation_loss
-from modgnn_rl.trainers.mixing import Mixture
+from modgnn_rl.trainers.collectors.behaviour import Mixture
+from modgnn_rl.trainers.collectors.flocks import as_windows
+from modgnn_rl.trainers.imitation.loss import imitation_loss
 
 OBSERVATION, ACTION, EXPERT = ("robots", "observation"), ("robots", "action"), ("robots", "expert")
 COMM_RANGE, REACH = 1.0, 0.4  # m; who is heard, and who is made way for

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import DAggerConfig, EvaluationConfig, FlockingConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import reynolds
-from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.training import train
 
 

@@ -28,9 +28,9 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.envs.flocking.metrics import smallest_distance
 from modgnn_rl.evaluation.rollout import fly
-from modgnn_rl.trainers.collection import as_windows
-from modgnn_rl.trainers.imitation import imitation_loss, random_receivers
-from modgnn_rl.trainers.mixing import Disturbance, Mixture, SafetyGate, disagreement
+from modgnn_rl.trainers.collectors.behaviour import Disturbance, Mixture, SafetyGate, disagreement
+from modgnn_rl.trainers.collectors.flocks import as_windows
+from modgnn_rl.trainers.imitation.loss import imitation_loss, random_receivers
 
 
 def nearness(tensordict: TensorDictBase) -> Tensor:

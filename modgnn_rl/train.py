@@ -27,7 +27,7 @@ def main(config: TrainConfig) -> None:
             RunFolder.open(folder)
     if config.resume is None:
         RunFolder.check_root(config.runs)
-    from modgnn_rl.distributed import say
+    from modgnn_rl.trainers.common.distributed import say
     from modgnn_rl.training import resume, train
 
     if config.resume is None:

@@ -16,7 +16,6 @@ import torch
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
-from modgnn_rl import distributed
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
 from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.recording import Recorder, spacing
@@ -30,12 +29,13 @@ from modgnn_rl.tracking.loading import changed_world, load_policy
 from modgnn_rl.tracking.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.bc import bc
-from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.dagger import dagger
+from modgnn_rl.trainers.loop.callbacks import Callback
+from modgnn_rl.trainers.loop.context import Session
+from modgnn_rl.trainers.loop.dashboard_callback import Watch, log_evaluation
+from modgnn_rl.trainers.loop.setup import check_training, settle_model
 from modgnn_rl.trainers.mappo import mappo
-from modgnn_rl.trainers.session import Session
-from modgnn_rl.trainers.setup import check_training, settle_model
-from modgnn_rl.trainers.watching import Watch, log_evaluation
 from modgnn_rl.utils.signals import Interruption
 from modgnn_rl.visualization.html import write_replay
 
@@ -58,7 +58,7 @@ def train(
         config: all settings.
         expert: whom to learn from: any TensorDictModule that reads the environment's keys and writes
             ``("agents", "expert_action")``; default: Reynolds flocking. Errors in the evaluation are against it too.
-        callbacks: people's own code, see `modgnn_rl.trainers.callbacks`.
+        callbacks: people's own code, see `modgnn_rl.trainers.loop.callbacks`.
 
     Raises:
         InputError: a bad setting, or a device or a logger that this machine does not have; nothing is created then.

@@ -29,8 +29,8 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.train import main
-from modgnn_rl.trainers import watching
-from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.loop import dashboard_callback
+from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.training import evaluate_run, prepare_torch, train
 
 SMALL = {"num_envs": 2, "batch_size": 16, "capacity": 400}
@@ -61,7 +61,7 @@ def _dagger(**settings):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> RunFolder:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(watching, "STEPS", 8)  # of the reference flights
+        patch.setattr(dashboard_callback, "STEPS", 8)  # of the reference flights
         return train(_config(tmp_path_factory.mktemp("runs"), _dagger(), logger="csv"))
 
 

@@ -11,18 +11,18 @@ from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import ReplayBuffer
 
-from modgnn_rl import distributed
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
 from modgnn_rl.data.dataset import FlightDataset
 from modgnn_rl.evaluation.rollout import fly
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.checkpoint import save_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.collection import Flocks, flocks_of_all_sizes, named_flocks, validation_flocks
-from modgnn_rl.trainers.journal import Journal
-from modgnn_rl.trainers.learner import Learner, fit_together, validate_together
-from modgnn_rl.trainers.session import Session
-from modgnn_rl.trainers.setup import DART_PARTS, make_learner, side_by_side
+from modgnn_rl.trainers.collectors.flocks import Flocks, flocks_of_all_sizes, named_flocks, validation_flocks
+from modgnn_rl.trainers.common import distributed
+from modgnn_rl.trainers.imitation.learner import Learner, fit_together, validate_together
+from modgnn_rl.trainers.loop.context import Session
+from modgnn_rl.trainers.loop.setup import DART_PARTS, make_learner, side_by_side
+from modgnn_rl.trainers.loop.training_loop import Journal
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["bc"]

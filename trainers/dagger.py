@@ -8,14 +8,14 @@ from typing import Any
 
 from modgnn_rl.configs.schema import DAggerConfig
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.callbacks import StopOnPlateau
-from modgnn_rl.trainers.collection import flocks_of_all_sizes, named_flocks, validation_flocks
-from modgnn_rl.trainers.journal import Journal
-from modgnn_rl.trainers.learner import fit_together, validate_together
-from modgnn_rl.trainers.measures import flight_metrics
-from modgnn_rl.trainers.mixing import SafetyGate, disagreement, expert_share, spread
-from modgnn_rl.trainers.session import Session
-from modgnn_rl.trainers.setup import make_learner
+from modgnn_rl.trainers.collectors.behaviour import SafetyGate, disagreement, expert_share, spread
+from modgnn_rl.trainers.collectors.flocks import flocks_of_all_sizes, named_flocks, validation_flocks
+from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
+from modgnn_rl.trainers.loop.callbacks import StopOnPlateau
+from modgnn_rl.trainers.loop.context import Session
+from modgnn_rl.trainers.loop.metrics import flight_metrics
+from modgnn_rl.trainers.loop.setup import make_learner
+from modgnn_rl.trainers.loop.training_loop import Journal
 
 __all__ = ["dagger"]
 

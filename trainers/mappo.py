@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from modgnn_rl.configs.schema import MAPPOConfig
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.collection import flocks_of, make_flights, named_flocks
-from modgnn_rl.trainers.journal import Journal
-from modgnn_rl.trainers.measures import flight_metrics, reward_metrics
-from modgnn_rl.trainers.ppo import Improver
-from modgnn_rl.trainers.session import Session
-from modgnn_rl.trainers.setup import initial_policy
+from modgnn_rl.trainers.collectors.flocks import flocks_of, make_flights, named_flocks
+from modgnn_rl.trainers.loop.context import Session
+from modgnn_rl.trainers.loop.metrics import flight_metrics, reward_metrics
+from modgnn_rl.trainers.loop.setup import initial_policy
+from modgnn_rl.trainers.loop.training_loop import Journal
+from modgnn_rl.trainers.ppo.learner import Improver
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["mappo"]

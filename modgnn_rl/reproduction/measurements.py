@@ -21,7 +21,7 @@ from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.reproduction.studies import Study, Subject, World
 from modgnn_rl.reproduction.tasks import Outcome, Result
 from modgnn_rl.tracking.loading import load_policy
-from modgnn_rl.trainers.imitation import imitation_loss
+from modgnn_rl.trainers.imitation.loss import imitation_loss
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.utils.seeds import derive_seed
 

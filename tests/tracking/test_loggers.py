@@ -26,7 +26,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.backends import Dashboard
 from modgnn_rl.tracking.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.loop.callbacks import Callback
 
 
 def config(logger, **wandb):

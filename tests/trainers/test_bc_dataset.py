@@ -22,7 +22,7 @@ from modgnn_rl.data.dataset import FlightDataset, FlightWindows
 from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.learner import Learner
+from modgnn_rl.trainers.imitation.learner import Learner
 from modgnn_rl.training import train
 
 WORLD = FlockingConfig(num_agents=5)

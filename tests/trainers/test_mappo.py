@@ -17,10 +17,10 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import fly
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.actor import GaussianActor
-from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.loop.callbacks import Callback
+from modgnn_rl.trainers.loop.setup import initial_policy, settle_model
 from modgnn_rl.trainers.mappo import anchor_weight
-from modgnn_rl.trainers.setup import initial_policy, settle_model
+from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.training import train
 
 WORLD = FlockingConfig(num_agents=4, max_steps=15)

@@ -22,7 +22,7 @@ from modgnn_rl.configs.schema import (
 from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.training import resume, train
 from modgnn_rl.utils.signals import Stopped
 

@@ -12,11 +12,11 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers import bc as trainer_module
-from modgnn_rl.trainers.callbacks import Callback
-from modgnn_rl.trainers.collection import Flocks
-from modgnn_rl.trainers.learner import Learner, fit_together, validate_together
-from modgnn_rl.trainers.mixing import Disturbance
-from modgnn_rl.trainers.setup import side_by_side
+from modgnn_rl.trainers.collectors.behaviour import Disturbance
+from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.imitation.learner import Learner, fit_together, validate_together
+from modgnn_rl.trainers.loop.callbacks import Callback
+from modgnn_rl.trainers.loop.setup import side_by_side
 from modgnn_rl.training import train
 
 WORLD = FlockingConfig(num_agents=4, max_steps=30)

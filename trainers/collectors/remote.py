@@ -19,9 +19,9 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.saving import Tensors
-from modgnn_rl.trainers.worker_side import Flight, packed, weights_of
-from modgnn_rl.trainers.workers import ProcessWorker, RayWorker, Worker, WorkerEndedError, close_all
+from modgnn_rl.trainers.collectors.worker import Flight, packed, weights_of
+from modgnn_rl.trainers.collectors.workers import ProcessWorker, RayWorker, Worker, WorkerEndedError, close_all
+from modgnn_rl.trainers.common.state import Tensors
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["RemoteFlights", "check_collector"]
@@ -63,7 +63,7 @@ def check_collector(config: CollectorConfig, num_envs: int) -> None:
 class RemoteFlights:
     """Flocks of one size that workers fly, each a part of them, in step with each other.
 
-    What `modgnn_rl.trainers.collection.FlockCollector` does in this process, with the same data. The first worker's
+    What `modgnn_rl.trainers.collectors.flocks.FlockCollector` does in this process, with the same data. The first worker's
     flocks are those of a `FlockCollector` with the seed ``derive_seed(seed, "worker", 0)``, and so on. A worker that
     dies, or does not answer, is replaced, and its flocks begin anew; a warning says so.
 

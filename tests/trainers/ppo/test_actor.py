@@ -13,7 +13,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import make_model
-from modgnn_rl.trainers.actor import GaussianActor
+from modgnn_rl.trainers.ppo.actor import GaussianActor
 
 FLOCKS, AGENTS, HOPS = 4, 5, 2
 

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from modgnn_rl import load_policy, training
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
 from modgnn_rl.tracking.checkpoint import load_checkpoint
-from modgnn_rl.trainers.callbacks import Callback, StopOnPlateau
+from modgnn_rl.trainers.loop.callbacks import Callback, StopOnPlateau
 from modgnn_rl.training import train
 
 SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 400}

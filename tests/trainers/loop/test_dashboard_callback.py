@@ -21,8 +21,8 @@ from modgnn_rl.evaluation.rollout import fly, reference_policies
 from modgnn_rl.tracking.backends import Dashboard
 from modgnn_rl.tracking.loggers import Dashboards
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers import watching
-from modgnn_rl.trainers.watching import Watch, log_evaluation
+from modgnn_rl.trainers.loop import dashboard_callback
+from modgnn_rl.trainers.loop.dashboard_callback import Watch, log_evaluation
 from modgnn_rl.training import train
 from modgnn_rl.visualization import video
 
@@ -78,8 +78,8 @@ class Recorder(Dashboard):
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
-    monkeypatch.setattr(watching, "STEPS", 6)
-    monkeypatch.setattr(watching, "FLOCKS", 0)  # that is one
+    monkeypatch.setattr(dashboard_callback, "STEPS", 6)
+    monkeypatch.setattr(dashboard_callback, "FLOCKS", 0)  # that is one
 
 
 def _config(runs, name="dagger", sizes=4, **others):
@@ -108,7 +108,7 @@ def watch(tmp_path):
 def test_training_is_the_same_to_the_last_bit(tmp_path, name, monkeypatch):
     recorder = Recorder()
     monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
-    monkeypatch.setattr(watching, "write_video", lambda *_: None)
+    monkeypatch.setattr(dashboard_callback, "write_video", lambda *_: None)
     plain = train(_config(tmp_path, name))
     monkeypatch.setattr(training, "make_logger", lambda *_: Dashboards({"recorder": lambda: recorder}))
     watched = train(_config(tmp_path, name, video_rounds=1))
@@ -152,7 +152,7 @@ def test_reference_lines_are_those_of_the_reference_flights(watch):
         sum(watch.lines[f"{size}/error"]["zero action"] for size in (4, 5)) / 2
     )
     assert lines["4/error"]["expert"] == 0
-    seed = watching.derive_seed(watch.config.seed, "references", 5)
+    seed = dashboard_callback.derive_seed(watch.config.seed, "references", 5)
     expert = reference_policies(world)["expert"]
     flights = fly(expert, world, num_agents=5, num_flocks=1, steps=6, seed=seed)
     assert lines["pair_force-K1/5/cohesion"]["expert"] == float(flights.cohesion.mean())
@@ -212,7 +212,7 @@ def test_what_fails_is_left_out_with_one_warning(watch, monkeypatch):
             watch.on_round(index, {"4/error": 0.5})
 
     watch.config.video_rounds = 2
-    monkeypatch.setattr(watching, "film", fail)
+    monkeypatch.setattr(dashboard_callback, "film", fail)
     with pytest.warns(RuntimeWarning) as caught:
         go_on()
     assert [str(warning.message) for warning in caught] == [

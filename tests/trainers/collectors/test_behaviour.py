@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.mixing import Mixture, expert_share
+from modgnn_rl.trainers.collectors.behaviour import Mixture, expert_share
 
 
 def _share(schedule, index):

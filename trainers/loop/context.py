@@ -12,7 +12,7 @@ from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.tracking.checkpoint import Checkpoint
 from modgnn_rl.tracking.loggers import Dashboards
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.utils.signals import Interruption
 
 __all__ = ["Session"]

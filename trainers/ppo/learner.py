@@ -13,16 +13,16 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacem
 from torchrl.modules import PopArtValueNorm, set_recurrent_mode
 from torchrl.objectives import MAPPOLoss, ValueEstimators
 
-from modgnn_rl import distributed
 from modgnn_rl.configs.schema import REFERENCE_SIZE, MAPPOConfig
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.actor import GaussianActor
-from modgnn_rl.trainers.collection import as_windows
-from modgnn_rl.trainers.critic import FlockCritic
-from modgnn_rl.trainers.imitation import random_receivers
-from modgnn_rl.trainers.learner import moments_of, restore_moments
-from modgnn_rl.trainers.saving import Tensors
-from modgnn_rl.trainers.stepping import Stepper
+from modgnn_rl.trainers.collectors.flocks import as_windows
+from modgnn_rl.trainers.common import distributed
+from modgnn_rl.trainers.common.optimization import Stepper
+from modgnn_rl.trainers.common.state import Tensors
+from modgnn_rl.trainers.imitation.learner import moments_of, restore_moments
+from modgnn_rl.trainers.imitation.loss import random_receivers
+from modgnn_rl.trainers.ppo.actor import GaussianActor
+from modgnn_rl.trainers.ppo.critic import FlockCritic
 from modgnn_rl.utils.seeds import derive_seed, seeded
 
 __all__ = ["AnchoredMAPPOLoss", "Improver", "improvement_window"]

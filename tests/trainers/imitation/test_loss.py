@@ -11,8 +11,8 @@ from tensordict import TensorDict
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collection import Flocks, as_windows, stores_messages, window_of
-from modgnn_rl.trainers.imitation import (
+from modgnn_rl.trainers.collectors.flocks import Flocks, as_windows, stores_messages, window_of
+from modgnn_rl.trainers.imitation.loss import (
     hide_velocities,
     imitation_loss,
     random_receivers,

@@ -14,11 +14,13 @@ from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
 
-from modgnn_rl import distributed
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ImitationConfig
 from modgnn_rl.models.equivariant import is_equivariant
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.imitation import (
+from modgnn_rl.trainers.common import distributed
+from modgnn_rl.trainers.common.optimization import Stepper
+from modgnn_rl.trainers.common.state import Tensors
+from modgnn_rl.trainers.imitation.loss import (
     are_alike,
     hide_velocities,
     imitation_loss,
@@ -27,8 +29,6 @@ from modgnn_rl.trainers.imitation import (
     rotate,
     stacked_losses,
 )
-from modgnn_rl.trainers.saving import Tensors
-from modgnn_rl.trainers.stepping import Stepper
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["Learner", "cosine_learning_rate", "fit_together", "moments_of", "restore_moments", "validate_together"]

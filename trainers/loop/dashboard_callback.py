@@ -16,7 +16,7 @@ from modgnn_rl.evaluation.rollout import Flights, fly, reference_policies
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.loggers import Dashboards
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.callbacks import Callback
+from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.utils.seeds import derive_seed, seeded
 from modgnn_rl.visualization.video import check_video, film, write_video
 

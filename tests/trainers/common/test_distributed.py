@@ -20,18 +20,19 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from modgnn_rl import distributed, make_model, training
+from modgnn_rl import make_model, training
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError, NotFinite
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.actor import GaussianActor
-from modgnn_rl.trainers.callbacks import Callback
-from modgnn_rl.trainers.collection import FlockCollector, Flocks
-from modgnn_rl.trainers.imitation import imitation_loss, random_receivers
-from modgnn_rl.trainers.learner import Learner
-from modgnn_rl.trainers.ppo import Improver
+from modgnn_rl.trainers.collectors.flocks import FlockCollector, Flocks
+from modgnn_rl.trainers.common import distributed
+from modgnn_rl.trainers.imitation.learner import Learner
+from modgnn_rl.trainers.imitation.loss import imitation_loss, random_receivers
+from modgnn_rl.trainers.loop.callbacks import Callback
+from modgnn_rl.trainers.ppo.actor import GaussianActor
+from modgnn_rl.trainers.ppo.learner import Improver
 from modgnn_rl.training import resume, train
 from modgnn_rl.utils.signals import Stopped
 

@@ -13,8 +13,8 @@ from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, 
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.tracking.checkpoint import load_checkpoint
-from modgnn_rl.trainers.collection import Flocks
-from modgnn_rl.trainers.mixing import Disturbance, Ensemble, SafetyGate, disagreement, spread
+from modgnn_rl.trainers.collectors.behaviour import Disturbance, Ensemble, SafetyGate, disagreement, spread
+from modgnn_rl.trainers.collectors.flocks import Flocks
 from modgnn_rl.training import train
 
 FLOCKS, AGENTS = 6, 4

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from modgnn_rl.trainers.critic import FlockCritic, PooledCritic, flock_features
-from modgnn_rl.trainers.imitation import random_rotations, rotate
+from modgnn_rl.trainers.imitation.loss import random_rotations, rotate
+from modgnn_rl.trainers.ppo.critic import FlockCritic, PooledCritic, flock_features
 
 DOUBLE = torch.float64
 

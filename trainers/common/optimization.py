@@ -8,9 +8,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from modgnn_rl import distributed
 from modgnn_rl.configs.schema import TrainerConfig
 from modgnn_rl.errors import NotFinite
+from modgnn_rl.trainers.common import distributed
 
 __all__ = ["Stepper", "blame"]
 

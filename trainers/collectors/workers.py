@@ -25,7 +25,7 @@ import torch
 from torchrl.collectors import MultiSyncCollector
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.worker_side import Flight, FlightCollector
+from modgnn_rl.trainers.collectors.worker import Flight, FlightCollector
 
 __all__ = ["ProcessWorker", "RayWorker", "Worker", "WorkerEndedError", "close_all"]
 

@@ -16,10 +16,10 @@ from modgnn_rl.configs.schema import REFERENCE_SIZE, CollectorConfig, FlockingCo
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.models.equivariant import is_equivariant
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.imitation import are_alike
-from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture, SafetyGate, spread
-from modgnn_rl.trainers.remote import RemoteFlights
-from modgnn_rl.trainers.saving import Part, Tensors
+from modgnn_rl.trainers.collectors.behaviour import Disturbance, Ensemble, Mixture, SafetyGate, spread
+from modgnn_rl.trainers.collectors.remote import RemoteFlights
+from modgnn_rl.trainers.common.state import Part, Tensors
+from modgnn_rl.trainers.imitation.loss import are_alike
 from modgnn_rl.utils.seeds import derive_seed, seeded
 
 __all__ = [

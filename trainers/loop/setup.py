@@ -22,10 +22,10 @@ from modgnn_rl.models.registry import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.loading import load_policy, stored_model
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.collection import flocks_of, window_of
-from modgnn_rl.trainers.learner import Learner
-from modgnn_rl.trainers.ppo import improvement_window
-from modgnn_rl.trainers.remote import check_collector
+from modgnn_rl.trainers.collectors.flocks import flocks_of, window_of
+from modgnn_rl.trainers.collectors.remote import check_collector
+from modgnn_rl.trainers.imitation.learner import Learner
+from modgnn_rl.trainers.ppo.learner import improvement_window
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["DART_PARTS", "check_training", "initial_policy", "make_learner", "settle_model", "side_by_side"]

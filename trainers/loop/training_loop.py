@@ -15,16 +15,16 @@ from typing import Any, Protocol
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from modgnn_rl import distributed
 from modgnn_rl.configs.schema import TrainerConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.checkpoint import save_checkpoint
-from modgnn_rl.trainers.callbacks import Callback
-from modgnn_rl.trainers.collection import FlockCollector, Flocks
-from modgnn_rl.trainers.remote import RemoteFlights
-from modgnn_rl.trainers.saving import Part, gather, scatter
-from modgnn_rl.trainers.session import Session
+from modgnn_rl.trainers.collectors.flocks import FlockCollector, Flocks
+from modgnn_rl.trainers.collectors.remote import RemoteFlights
+from modgnn_rl.trainers.common import distributed
+from modgnn_rl.trainers.common.state import Part, gather, scatter
+from modgnn_rl.trainers.loop.callbacks import Callback
+from modgnn_rl.trainers.loop.context import Session
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.utils.signals import Stopped
 

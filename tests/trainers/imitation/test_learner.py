@@ -11,8 +11,8 @@ import torch
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collection import Flocks
-from modgnn_rl.trainers.learner import Learner, cosine_learning_rate
+from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.imitation.learner import Learner, cosine_learning_rate
 
 RATES = (3e-3, 1e-3, 1e-4)
 

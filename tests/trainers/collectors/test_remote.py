@@ -22,11 +22,11 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.actor import GaussianActor
-from modgnn_rl.trainers.collection import FlockCollector
-from modgnn_rl.trainers.mixing import Disturbance, Ensemble, Mixture
-from modgnn_rl.trainers.remote import RemoteFlights, check_collector
-from modgnn_rl.trainers.worker_side import packed
+from modgnn_rl.trainers.collectors.behaviour import Disturbance, Ensemble, Mixture
+from modgnn_rl.trainers.collectors.flocks import FlockCollector
+from modgnn_rl.trainers.collectors.remote import RemoteFlights, check_collector
+from modgnn_rl.trainers.collectors.worker import packed
+from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.utils.seeds import derive_seed
 
 SEED, AGENTS, STEPS = 3, 4, 4
@@ -37,7 +37,7 @@ import os, sys
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.remote import RemoteFlights
+from modgnn_rl.trainers.collectors.remote import RemoteFlights
 if __name__ == "__main__":
     flown = (make_model("gcn", seed=0), Reynolds())
     flights = RemoteFlights(FlockingConfig(), 2, 3, flown, steps=2, seed=0, collector=CollectorConfig(sys.argv[1], 2))

@@ -22,7 +22,7 @@ from torchrl.envs import EnvBase
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.parallel import make_flocks
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.mixing import Mixture
+from modgnn_rl.trainers.collectors.behaviour import Mixture
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["Flight", "FlightCollector", "packed", "weights_of"]
@@ -33,7 +33,7 @@ class Flight:
     """What a worker flies; sent to it when it starts.
 
     Attributes:
-        config, num_envs, num_agents, steps, seed, device: see `modgnn_rl.trainers.collection.FlockCollector`.
+        config, num_envs, num_agents, steps, seed, device: see `modgnn_rl.trainers.collectors.flocks.FlockCollector`.
         behaviour: the modules that fly and label, made by `packed`.
     """
 

@@ -11,7 +11,7 @@ from torch import nn
 
 from modgnn_rl.configs.schema import DAggerConfig
 from modgnn_rl.errors import NotFinite
-from modgnn_rl.trainers.stepping import PATIENCE, Stepper
+from modgnn_rl.trainers.common.optimization import PATIENCE, Stepper
 
 ALL = torch.tensor(12)  # agents that count in a batch
 

@@ -1,0 +1,1 @@
+"""Collection of rollouts in this process or in workers, and the data they become."""

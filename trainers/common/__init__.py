@@ -1,0 +1,1 @@
+"""What all trainers share: optimization, distribution, sampling, state."""

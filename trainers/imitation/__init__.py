@@ -1,0 +1,1 @@
+"""Imitation loss and learner, shared by behaviour cloning and DAgger."""

@@ -1,0 +1,1 @@
+"""The training loop: context, setup, callbacks, metrics, checkpoints."""

@@ -1,0 +1,1 @@
+"""Actor, critic, loss and learner of MAPPO."""
