@@ -15,7 +15,7 @@ import numpy as np
 
 from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import TrainConfig
-from modgnn_rl.resuming import TRAINER_SETTINGS
+from modgnn_rl.experiment.resume import TRAINER_SETTINGS
 
 WHOLE = ("forward", "logging", "logging: reference flights, once")
 
@@ -61,9 +61,9 @@ def watched() -> Clock:
     from torch.optim.swa_utils import AveragedModel
     from torchrl.data import ReplayBuffer
 
-    from modgnn_rl import training
     from modgnn_rl.envs import FlockingEnv
     from modgnn_rl.envs.flocking.expert import Reynolds
+    from modgnn_rl.experiment import training
     from modgnn_rl.nn.modgnn import ModGNN
     from modgnn_rl.trainers.collectors.flocks import FlockCollector, Flocks
     from modgnn_rl.trainers.common.optimization import Stepper
@@ -96,7 +96,7 @@ def watched() -> Clock:
 
 def main(config: TrainConfig) -> None:
     """Train, and print where the time went; there is no evaluation at the end."""
-    from modgnn_rl.training import train
+    from modgnn_rl.experiment.training import train
 
     clock = watched()
     train(config)

@@ -2,7 +2,7 @@
 
     python examples/own_callback.py
 
-The expert below keeps more distance than the usual one. `modgnn_rl.training.train` does all that
+The expert below keeps more distance than the usual one. `modgnn_rl.experiment.training.train` does all that
 ``python -m modgnn_rl.train`` does, and leaves the same folder; its callbacks are called while it works: one prints,
 one stops the training as soon as the policy is good enough.
 """
@@ -20,8 +20,8 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import DAggerConfig, EvaluationConfig, FlockingConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import reynolds
+from modgnn_rl.experiment.training import train
 from modgnn_rl.trainers.loop.callbacks import Callback
-from modgnn_rl.training import train
 
 
 def spacious(observation: Tensor) -> Tensor:

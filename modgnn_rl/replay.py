@@ -25,7 +25,7 @@ def main(config: ReplayConfig) -> None:
         python -m modgnn_rl.replay 'run=runs/<date>-<name>' format=svg step=400
     """
     refuse(config)
-    from modgnn_rl.replaying import replay_run
+    from modgnn_rl.experiment.replay import replay_run
 
     path = replay_run(config)
     what = {"html": "flight", "mp4": "film"}.get(config.format, "picture")

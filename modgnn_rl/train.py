@@ -7,7 +7,7 @@ import sys
 
 from modgnn_rl.cli.command import run_command, settings_given
 from modgnn_rl.configs.schema import TrainConfig
-from modgnn_rl.resuming import TRAINER_SETTINGS, with_stored_trainer
+from modgnn_rl.experiment.resume import TRAINER_SETTINGS, with_stored_trainer
 from modgnn_rl.tracking.run_folder import RunFolder
 
 
@@ -27,8 +27,8 @@ def main(config: TrainConfig) -> None:
             RunFolder.open(folder)
     if config.resume is None:
         RunFolder.check_root(config.runs)
+    from modgnn_rl.experiment.training import resume, train
     from modgnn_rl.trainers.common.distributed import say
-    from modgnn_rl.training import resume, train
 
     if config.resume is None:
         run = train(config)

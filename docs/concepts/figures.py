@@ -29,9 +29,9 @@ from modgnn_rl.configs.schema import BCConfig, DAggerConfig, EvaluationConfig, F
 from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
 from modgnn_rl.envs.flocking.metrics import action_error, is_lost
 from modgnn_rl.evaluation.rollout import endless_env
+from modgnn_rl.experiment.training import train
 from modgnn_rl.reporting.figure import GRID, INK, PAPER, draw, styles_of
 from modgnn_rl.reporting.plots import Curve, draw_curves, draw_panels
-from modgnn_rl.training import train
 from modgnn_rl.utils.seeds import seeded
 
 HERE = Path(__file__).parent

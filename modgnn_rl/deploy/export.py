@@ -26,10 +26,10 @@ from modgnn_rl.configs.settings import check
 from modgnn_rl.deploy.agent import LinkData, check_local, link_data, no_messages, own_data, step
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
+from modgnn_rl.experiment.training import prepare_torch
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.loading import load_policy, stored_world
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.training import prepare_torch
 from modgnn_rl.utils.files import fsync_file, fsync_folder
 
 __all__ = ["NEIGHBOURS", "TOLERANCE", "Exported", "check_packages", "export_agent", "export_run", "write_folder"]

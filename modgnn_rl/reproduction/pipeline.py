@@ -20,11 +20,11 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
 )
 from modgnn_rl.data.collect import collect
+from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.reproduction.measurements import VALIDATION, flight_cell, fly_references, fly_subject, look_on, validate
 from modgnn_rl.reproduction.studies import Study, Subject, World
 from modgnn_rl.reproduction.tasks import Cell, Result
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.training import resume, train
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["cells_of"]

@@ -27,6 +27,7 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
 )
 from modgnn_rl.errors import InputError
+from modgnn_rl.experiment.training import train
 from modgnn_rl.models.equivariant import VectorSquash
 from modgnn_rl.models.registry import (
     MODELS,
@@ -39,7 +40,6 @@ from modgnn_rl.models.registry import (
     register_model,
 )
 from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
-from modgnn_rl.training import train
 
 seeds = st.integers(0, 999)
 local_models = pytest.mark.parametrize("name", [name for name in MODELS if name != "central"])

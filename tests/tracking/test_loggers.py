@@ -19,10 +19,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from modgnn_rl import training
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig, WandbConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
+from modgnn_rl.experiment import training
 from modgnn_rl.tracking.backends import Dashboard
 from modgnn_rl.tracking.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.tracking.run_folder import RunFolder

@@ -350,7 +350,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 @pytest.mark.slow
 def test_names_are_those_that_training_gives(tmp_path):
     from modgnn_rl.configs.schema import EvaluationConfig, FlockingConfig
-    from modgnn_rl.training import train
+    from modgnn_rl.experiment.training import train
 
     small = {"num_envs": 1, "cloning_steps": 10, "cloning_updates": 20, "batch_size": 16, "held_out": 1}
     trainer = BCConfig(models=["moment_force", "gcn"], **small)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from modgnn_rl import make_model, training
+from modgnn_rl import make_model
 from modgnn_rl.configs.schema import (
     BCConfig,
     CollectConfig,
@@ -20,10 +20,11 @@ from modgnn_rl.configs.schema import (
 from modgnn_rl.data.collect import collect
 from modgnn_rl.data.dataset import FlightDataset, FlightWindows
 from modgnn_rl.errors import InputError
+from modgnn_rl.experiment import training
+from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.imitation.learner import Learner
-from modgnn_rl.training import train
 
 WORLD = FlockingConfig(num_agents=5)
 EPISODES, STEPS = 6, 30

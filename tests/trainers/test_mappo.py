@@ -11,17 +11,18 @@ import pytest
 import torch
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from modgnn_rl import load_policy, training
+from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import fly
+from modgnn_rl.experiment import training
+from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.trainers.loop.setup import initial_policy, settle_model
 from modgnn_rl.trainers.mappo import anchor_weight
 from modgnn_rl.trainers.ppo.actor import GaussianActor
-from modgnn_rl.training import train
 
 WORLD = FlockingConfig(num_agents=4, max_steps=15)
 

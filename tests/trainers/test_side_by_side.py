@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from modgnn_rl import load_policy, make_model, training
+from modgnn_rl import load_policy, make_model
 from modgnn_rl.configs.schema import BCConfig, FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
+from modgnn_rl.experiment import training
+from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers import bc as trainer_module
@@ -17,7 +19,6 @@ from modgnn_rl.trainers.collectors.flocks import Flocks
 from modgnn_rl.trainers.imitation.learner import Learner, fit_together, validate_together
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.trainers.loop.setup import side_by_side
-from modgnn_rl.training import train
 
 WORLD = FlockingConfig(num_agents=4, max_steps=30)
 

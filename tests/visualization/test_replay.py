@@ -17,8 +17,8 @@ from modgnn_rl.envs.flocking.expert import as_matrix
 from modgnn_rl.envs.flocking.recording import METRICS, QUANTUM, Recorder, Recording, spacing
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import fly, reference_policies
+from modgnn_rl.experiment.replay import record
 from modgnn_rl.replay import refuse
-from modgnn_rl.replaying import record
 from modgnn_rl.visualization import html
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -22,7 +22,7 @@ class Callback:
             def on_round(self, index, metrics):
                 print(index, metrics["error"])
 
-        modgnn_rl.training.train(config, callbacks=[Print()])
+        modgnn_rl.experiment.training.train(config, callbacks=[Print()])
     """
 
     def on_start(self, policies: Mapping[str, ModGNN]) -> None:

@@ -8,14 +8,15 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.modules import get_primers_from_module
 
-from modgnn_rl import load_policy, make_model, training
+from modgnn_rl import load_policy, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
+from modgnn_rl.experiment import training
+from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.trainers.collectors.behaviour import Disturbance, Ensemble, SafetyGate, disagreement, spread
 from modgnn_rl.trainers.collectors.flocks import Flocks
-from modgnn_rl.training import train
 
 FLOCKS, AGENTS = 6, 4
 

@@ -20,10 +20,12 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from modgnn_rl import make_model, training
+from modgnn_rl import make_model
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError, NotFinite
+from modgnn_rl.experiment import training
+from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.collectors.flocks import FlockCollector, Flocks
@@ -33,7 +35,6 @@ from modgnn_rl.trainers.imitation.loss import imitation_loss, random_receivers
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.trainers.ppo.learner import Improver
-from modgnn_rl.training import resume, train
 from modgnn_rl.utils.signals import Stopped
 
 WORLD = FlockingConfig(num_agents=4, max_steps=15)

@@ -10,11 +10,12 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from modgnn_rl import load_policy, training
+from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
+from modgnn_rl.experiment import training
+from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.trainers.loop.callbacks import Callback, StopOnPlateau
-from modgnn_rl.training import train
 
 SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 400}
 TRAINERS = {

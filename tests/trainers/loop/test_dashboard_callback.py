@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from modgnn_rl import load_policy, training
+from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import (
     BCConfig,
     DAggerConfig,
@@ -18,12 +18,13 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
 )
 from modgnn_rl.evaluation.rollout import fly, reference_policies
+from modgnn_rl.experiment import training
+from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.backends import Dashboard
 from modgnn_rl.tracking.loggers import Dashboards
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop import dashboard_callback
 from modgnn_rl.trainers.loop.dashboard_callback import Watch, log_evaluation
-from modgnn_rl.training import train
 from modgnn_rl.visualization import video
 
 TRAINERS = {

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from modgnn_rl import load_policy, training
+from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import (
     BCConfig,
     CollectorConfig,
@@ -20,10 +20,11 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
 )
 from modgnn_rl.errors import InputError
+from modgnn_rl.experiment import training
+from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
-from modgnn_rl.training import resume, train
 from modgnn_rl.utils.signals import Stopped
 
 SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}

@@ -1,4 +1,4 @@
-"""Runs that are killed, on disks that are full, and files that are damaged: `pytest -m slow tests/test_survival.py`."""
+"""Runs that are killed, on disks that are full, and files that are damaged: `pytest -m slow tests/experiment/test_survival.py`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from typing import Any
 import pytest
 import torch
 
-from modgnn_rl import training
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, TrainConfig
 from modgnn_rl.errors import InputError
+from modgnn_rl.experiment import training
+from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint, save_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.training import resume, train
 
 SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}
 TRAINERS: dict[str, Any] = {

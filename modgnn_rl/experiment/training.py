@@ -22,8 +22,8 @@ from modgnn_rl.envs.flocking.recording import Recorder, spacing
 from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.evaluation.rollout import evaluate
 from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_flights
+from modgnn_rl.experiment.resume import begins_anew, changed_config, differences, stored_config
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.resuming import begins_anew, changed_config, differences, stored_config
 from modgnn_rl.tracking.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.tracking.loading import changed_world, load_policy
 from modgnn_rl.tracking.loggers import Dashboards, check_logger, make_logger

@@ -15,9 +15,9 @@ from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.recording import Recorder, Recording, spacing
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import fly, reference_policies
+from modgnn_rl.experiment.training import prepare_torch
 from modgnn_rl.tracking.loading import changed_world, load_policy
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.training import prepare_torch
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.visualization.html import write_replay
 
