@@ -13,7 +13,7 @@ from modgnn_rl.errors import InputError
 
 __all__ = ["commands", "completion", "overview"]
 
-HERE = Path(__file__).parent
+ROOT = Path(modgnn_rl.__file__).parent
 FIRST = {
     "train": "trainer.rounds=10 evaluation.num_flocks=10",
     "replay": "'run=runs/<date>-<name>'",
@@ -27,7 +27,7 @@ def commands() -> dict[str, str]:
     Read from the files, where whatever calls `modgnn_rl.cli.command.run_command` is a command: importing them takes long.
     """
     found = {}
-    for path in sorted(HERE.glob("*.py")):
+    for path in sorted(ROOT.glob("*.py")):
         source = path.read_text(encoding="utf-8")
         if "    run_command(main" in source:
             body = {getattr(node, "name", ""): node for node in ast.parse(source).body}
@@ -74,7 +74,7 @@ def completion(shell: str) -> str:
     Raises:
         InputError: it is another one.
     """
-    scripts = {path.suffix[1:]: path for path in sorted(HERE.glob("completion.*"))}
+    scripts = {path.suffix[1:]: path for path in sorted(Path(__file__).parent.glob("completion.*"))}
     if shell not in scripts:
         raise InputError(f"there is completion for {', '.join(scripts)}, not for {shell}{suggestion(shell, scripts)}")
     modules = " ".join(f"modgnn_rl.{name}" for name in commands())

@@ -114,7 +114,7 @@ def _page(title: str, sections: Sequence[Section], provenance: Provenance, drawi
     if not drawings and any(isinstance(part, Figure) for section in sections for part in section.parts):
         body.insert(0, f'<p class="note">{_NO_FIGURES}</p>')
     light, dark = page_colours()
-    template = importlib.resources.files("modgnn_rl").joinpath("report.html").read_text(encoding="utf-8")
+    template = importlib.resources.files("modgnn_rl.reporting").joinpath("report.html").read_text(encoding="utf-8")
     return Template(template).substitute(
         title=escape(title),
         made=escape(_made(provenance)),

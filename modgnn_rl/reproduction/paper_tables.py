@@ -37,7 +37,7 @@ Row = Subject | str
 @functools.cache
 def published() -> dict[str, Any]:
     """The paper's figures: ``validation_loss``, ``model_evaluation`` and ``generalization`` by model and hops."""
-    text = importlib.resources.files("modgnn_rl").joinpath("paper_tables.yaml").read_text(encoding="utf-8")
+    text = importlib.resources.files("modgnn_rl.reproduction").joinpath("paper_tables.yaml").read_text(encoding="utf-8")
     return dict(yaml.safe_load(text))
 
 
