@@ -18,9 +18,9 @@ from importlib.metadata import version
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.experiment.training import prepare_torch
-from modgnn_rl.trainers.collectors.flocks import FlockCollector
+from modgnn_rl.trainers.collectors.local import FlockCollector
 from modgnn_rl.trainers.collectors.remote import RemoteFlights
+from modgnn_rl.utils.device import prepare_torch
 
 FLOCKS, AGENTS, STEPS, WORKERS = 32, 32, 40, 2
 REPETITIONS = 5

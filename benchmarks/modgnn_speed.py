@@ -32,8 +32,7 @@ from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
-from modgnn_rl.models.equivariant import mlp
-from modgnn_rl.models.registry import LATENT
+from modgnn_rl.models.blocks import LATENT, mlp
 from modgnn_rl.nn import aggregation, graph
 
 HIDDEN, INPUTS, OUTPUTS = 32, 6, 3

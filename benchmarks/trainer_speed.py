@@ -20,10 +20,10 @@ from torchrl.data import ReplayBuffer
 from modgnn_rl import ModGNN, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.experiment.training import prepare_torch
 from modgnn_rl.trainers.collectors.flocks import Flocks
 from modgnn_rl.trainers.imitation.learner import Learner
 from modgnn_rl.trainers.imitation.loss import imitation_loss, stacked_losses
+from modgnn_rl.utils.device import prepare_torch
 
 REPETITIONS = 9
 # Model, layers, states in a batch, receivers in each of 32 agents.

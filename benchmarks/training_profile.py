@@ -65,7 +65,8 @@ def watched() -> Clock:
     from modgnn_rl.envs.flocking.expert import Reynolds
     from modgnn_rl.experiment import training
     from modgnn_rl.nn.modgnn import ModGNN
-    from modgnn_rl.trainers.collectors.flocks import FlockCollector, Flocks
+    from modgnn_rl.trainers.collectors.flocks import Flocks
+    from modgnn_rl.trainers.collectors.local import FlockCollector
     from modgnn_rl.trainers.common.optimization import Stepper
     from modgnn_rl.trainers.imitation.loss import learner
     from modgnn_rl.trainers.loop.dashboard_callback import Watch

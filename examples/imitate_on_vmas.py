@@ -25,9 +25,9 @@ from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv, Unar
 from torchrl.modules import get_primers_from_module
 
 from modgnn_rl import ModGNN, ModGNNLayer
-from modgnn_rl.models.equivariant import mlp
+from modgnn_rl.models.blocks import mlp
 from modgnn_rl.trainers.collectors.behaviour import Mixture
-from modgnn_rl.trainers.collectors.flocks import as_windows
+from modgnn_rl.trainers.collectors.windows import as_windows
 from modgnn_rl.trainers.imitation.loss import imitation_loss
 
 OBSERVATION, ACTION, EXPERT = ("robots", "observation"), ("robots", "action"), ("robots", "expert")

@@ -29,8 +29,9 @@ from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.envs.flocking.metrics import smallest_distance
 from modgnn_rl.evaluation.rollout import fly
 from modgnn_rl.trainers.collectors.behaviour import Disturbance, Mixture, SafetyGate, disagreement
-from modgnn_rl.trainers.collectors.flocks import as_windows
-from modgnn_rl.trainers.imitation.loss import imitation_loss, random_receivers
+from modgnn_rl.trainers.collectors.windows import as_windows
+from modgnn_rl.trainers.common.sampling import random_receivers
+from modgnn_rl.trainers.imitation.loss import imitation_loss
 
 
 def nearness(tensordict: TensorDictBase) -> Tensor:

@@ -24,7 +24,7 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.models.registry import BallHead, Zero
+from modgnn_rl.models.blocks import BallHead, Zero
 
 MAX_SPEED = 0.92  # m/s
 

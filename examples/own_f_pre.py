@@ -22,7 +22,7 @@ from torchrl.envs import TransformedEnv, UnaryTransform
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.models.registry import BallHead, Scale
+from modgnn_rl.models.blocks import BallHead, Scale
 
 
 class RoleForce(nn.Module):

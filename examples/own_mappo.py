@@ -24,7 +24,7 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.rewards import flocking_costs, flocking_reward
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.trainers.ppo.critic import FlockCritic
-from modgnn_rl.trainers.ppo.learner import AnchoredMAPPOLoss
+from modgnn_rl.trainers.ppo.loss import AnchoredMAPPOLoss
 from modgnn_rl.utils.tensors import pair_distances
 
 WEIGHTS = {"spacing": 1.0, "cohesion": 0.02, "collision": 1.0, "alignment": 0.2, "effort": 0.02}  # of the costs

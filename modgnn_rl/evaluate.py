@@ -19,7 +19,7 @@ def main(config: EvaluateConfig) -> None:
         python -m modgnn_rl.evaluate 'run=runs/<date>-<name>' env.physics=bullet env.message_loss=0.2
     """
     RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
-    from modgnn_rl.experiment.training import evaluate_run
+    from modgnn_rl.experiment.evaluate import evaluate_run
 
     file = evaluate_run(config)
     print(f"The table is in {file.with_suffix('.md')}, all figures in {file}")

@@ -28,7 +28,7 @@ def main(config: ExportConfig) -> None:
         python -m modgnn_rl.export 'run=runs/<date>-<name>' output=robot
     """
     RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
-    from modgnn_rl.deploy.export import export_run
+    from modgnn_rl.experiment.export import export_run
 
     print(report(*export_run(config)))
 

@@ -34,12 +34,12 @@ def main(config: ReproduceConfig) -> int:
         )
     recordable(config.env, config.scale.steps)
     folder = claim_folder(config)
-    from modgnn_rl.experiment.training import prepare_torch
     from modgnn_rl.reproduction.measurements import Measurements
     from modgnn_rl.reproduction.pages import write_study
     from modgnn_rl.reproduction.pipeline import cells_of
     from modgnn_rl.reproduction.studies import study_of
     from modgnn_rl.reproduction.tasks import run_cells
+    from modgnn_rl.utils.device import prepare_torch
 
     prepare_torch(config.device, config.threads)
     study = study_of(config)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from modgnn_rl.configs.schema import MAPPOConfig
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.collectors.flocks import flocks_of, make_flights, named_flocks
+from modgnn_rl.trainers.collectors.flocks import flocks_of, named_flocks
+from modgnn_rl.trainers.collectors.local import make_flights
 from modgnn_rl.trainers.loop.context import Session
 from modgnn_rl.trainers.loop.metrics import flight_metrics, reward_metrics
 from modgnn_rl.trainers.loop.setup import initial_policy

@@ -17,13 +17,13 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.nn.graph import Graph, Pairs
+from modgnn_rl.nn.graph import Graph
 from modgnn_rl.nn.primer import AgentCache, missing
-from modgnn_rl.nn.topology import Topology
+from modgnn_rl.nn.topology import Topology, as_matrix, reachable
 from modgnn_rl.utils.compile import compiled
 from modgnn_rl.utils.tensors import clip_to_ball, is_transformed, pair_blocks, pair_differences, squared_norm
 
-__all__ = ["LocalReynolds", "Reynolds", "as_matrix", "reachable", "reynolds"]
+__all__ = ["LocalReynolds", "Reynolds", "reynolds"]
 
 SOFTENING = 1e-6  # m^2 (and m^2/s^2): keeps the rule finite when two agents meet
 
@@ -112,21 +112,6 @@ def _pair_forces(offset: Sequence[Tensor], drift: Sequence[Tensor], gains: tuple
     pull = cohesion * distance - separation / (square * distance)
     follow = alignment * (squared_norm(drift) + SOFTENING).sqrt()
     return [torch.addcmul(pull * p, follow, v) for p, v in zip(offset, drift, strict=True)]
-
-
-def as_matrix(adjacency: Tensor, num_agents: int) -> Tensor:
-    """A graph as a bool matrix [..., N, N], from any form that `modgnn_rl.nn.topology.Topology` reads."""
-    graph = Topology(adjacency, num_agents, form="pairs").everyone()
-    assert isinstance(graph, Pairs)
-    return graph.mask.view(*adjacency.shape[:-2], num_agents, num_agents)
-
-
-def reachable(adjacency: Tensor, hops: int) -> Tensor:
-    """Who hears of whom over at most ``hops`` >= 1 links; bool [..., N, N] -> bool [..., N, N], zero diagonal."""
-    reached = adjacency
-    for _ in range(hops - 1):
-        reached = reached | ((adjacency.float() @ reached.float()) > 0)
-    return reached & ~torch.eye(adjacency.shape[-1], dtype=torch.bool, device=adjacency.device)
 
 
 class Reynolds(TensorDictModuleBase):

@@ -26,7 +26,7 @@ from modgnn_rl.data.manifest import FILES, Manifest, check_shard, describe_files
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.experiment.training import prepare_torch
+from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.utils.files import fsync_file, fsync_folder
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.utils.seeds import derive_seed

@@ -21,18 +21,12 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from modgnn_rl.configs.schema import ExportConfig
-from modgnn_rl.configs.settings import check
 from modgnn_rl.deploy.agent import LinkData, check_local, link_data, no_messages, own_data, step
-from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
-from modgnn_rl.experiment.training import prepare_torch
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.tracking.loading import load_policy, stored_world
-from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.files import fsync_file, fsync_folder
 
-__all__ = ["NEIGHBOURS", "TOLERANCE", "Exported", "check_packages", "export_agent", "export_run", "write_folder"]
+__all__ = ["NEIGHBOURS", "TOLERANCE", "Exported", "check_packages", "export_agent", "write_folder"]
 
 NEIGHBOURS = (0, 1, 2, 7, 10, 40)  # numbers of neighbours for which the files are checked
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}  # of the larger of 1 and the largest entry
@@ -114,31 +108,6 @@ def export_agent(
     }
     write_folder(folder, files)
     return Exported(folder, metadata, difference)
-
-
-def export_run(config: ExportConfig) -> tuple[Exported, ModGNN]:
-    """Export the policy of a run.
-
-    Returns:
-        what was made, and the policy.
-
-    Raises:
-        InputError: a bad setting, no such run, no readable policy in it, or for what `export_agent` raises it.
-    """
-    check(config)
-    check_packages()
-    prepare_torch("cpu", config.threads)
-    policy, run = load_policy(config.run), RunFolder.open(config.run)
-    world = stored_world(run)
-    spec = FlockingEnv(1, 2, config=world).observation_spec["agents", "observation"]
-    exported = export_agent(
-        policy,
-        run.path / "agent" if config.output is None else config.output,
-        torch.zeros(spec.shape[-1], dtype=spec.dtype),
-        model=run.config["model"]["name"],
-        control_frequency=world.control_frequency,
-    )
-    return exported, policy
 
 
 def check_packages() -> None:

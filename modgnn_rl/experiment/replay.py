@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig, as_list
 from modgnn_rl.configs.settings import check
-from modgnn_rl.envs.flocking.recording import Recorder, Recording, spacing
+from modgnn_rl.envs.flocking.recording import Recording, spacing
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation.rollout import fly, reference_policies
-from modgnn_rl.experiment.training import prepare_torch
+from modgnn_rl.evaluation.rollout import reference_policies
 from modgnn_rl.tracking.loading import changed_world, load_policy
 from modgnn_rl.tracking.run_folder import RunFolder
+from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.visualization.html import write_replay
+from modgnn_rl.visualization.recording import record
 
-__all__ = ["record", "replay_run"]
+__all__ = ["replay_run"]
 
 
 def replay_run(config: ReplayConfig) -> Path:
@@ -108,52 +107,3 @@ def _fly_all(
                 viewer = stack.enter_context(Viewer(world, config.port))
             recordings[name] = record(policy, world, every=every, progress=progress, watch=viewer, **flight)
     return recordings
-
-
-def record(
-    policy: TensorDictModuleBase,
-    world: FlockingConfig,
-    *,
-    num_agents: int,
-    steps: int,
-    seed: int,
-    every: int = 1,
-    device: str = "cpu",
-    progress: Progress | None = None,
-    watch: Callable[[TensorDictBase], None] | None = None,
-    expert: TensorDictModuleBase | None = None,
-) -> Recording:
-    """Fly one flock with a policy and keep what it looks like, for `modgnn_rl.visualization.html.write_replay`.
-
-    Args:
-        policy: as `modgnn_rl.evaluation.rollout.fly` flies it.
-        world: the world.
-        num_agents: agents in the flock.
-        steps: steps of the flight, which goes on whatever happens to the flock.
-        seed: seed of start and leader.
-        every: of the steps flown, each how-manyth is kept.
-        device: where to fly.
-        progress: counts steps.
-        watch: is shown the flock before each step, too.
-        expert: what errors are measured against; default: Reynolds flocking.
-    """
-    recorder = Recorder(world, every)
-
-    def look(tensordict: TensorDictBase) -> None:
-        recorder(tensordict)
-        if watch is not None:
-            watch(tensordict)
-
-    fly(
-        policy,
-        world,
-        num_agents=num_agents,
-        num_flocks=1,
-        steps=steps,
-        seed=seed,
-        device=device,
-        progress=progress,
-        expert=expert,
-        watch=look,
-    )
-    return recorder.recording()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import logging
 import os
 import shlex
 import sys
@@ -12,20 +10,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
-from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, TrainConfig, as_list
+from modgnn_rl.configs.schema import TrainConfig, as_list
 from modgnn_rl.configs.settings import check
-from modgnn_rl.envs.flocking.recording import Recorder, spacing
 from modgnn_rl.errors import InputError, one_line
-from modgnn_rl.evaluation.rollout import evaluate
-from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_flights
+from modgnn_rl.experiment.evaluate import evaluate_policies
 from modgnn_rl.experiment.resume import begins_anew, changed_config, differences, stored_config
-from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
-from modgnn_rl.tracking.loading import changed_world, load_policy
 from modgnn_rl.tracking.loggers import Dashboards, check_logger, make_logger
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.bc import bc
@@ -36,12 +29,11 @@ from modgnn_rl.trainers.loop.context import Session
 from modgnn_rl.trainers.loop.dashboard_callback import Watch, log_evaluation
 from modgnn_rl.trainers.loop.setup import check_training, settle_model
 from modgnn_rl.trainers.mappo import mappo
+from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.utils.signals import Interruption
-from modgnn_rl.visualization.html import write_replay
 
-__all__ = ["TRAINERS", "evaluate_policies", "evaluate_run", "prepare_torch", "resume", "train"]
+__all__ = ["TRAINERS", "resume", "train"]
 
-REPLAY_FRAMES = 250  # of the replay beside a table: keeping more would take longer than a second
 TRAINERS = {"bc": bc, "dagger": dagger, "mappo": mappo}
 
 
@@ -188,100 +180,3 @@ def _note_end(run: RunFolder, error: BaseException) -> None:
     if stopped:
         resuming = shlex.quote(f"resume={run.path}")
         print(f"Stopped; to go on: python -m modgnn_rl.train {resuming}", file=sys.stderr, flush=True)
-
-
-def evaluate_policies(
-    run: RunFolder,
-    policies: Mapping[str, ModGNN],
-    world: FlockingConfig,
-    settings: EvaluationConfig,
-    sizes: list[int],
-    device: str,
-    changes: str = "",
-    expert: TensorDictModuleBase | None = None,
-) -> dict[int, dict[str, Any]]:
-    """Fly a run's policies and the reference policies, and write the table of each size into the run folder.
-
-    Beside it goes a replay of the first flock, flown by the policies and by the expert. Tables of other sizes that the
-    folder holds already are kept; a world changed since training has files of its own.
-
-    Returns:
-        for each number of agents, the table that `modgnn_rl.evaluation.table.summarise_flights` makes.
-    """
-    tables, replays = {}, {}
-    for size in sizes:
-        every = spacing(size, settings.steps, REPLAY_FRAMES)
-        replays[size] = {name: Recorder(world, every) for name in (*policies, "expert")}
-        flights = evaluate(
-            policies,
-            world,
-            num_agents=size,
-            num_flocks=settings.num_flocks,
-            steps=settings.steps,
-            seed=settings.seed,
-            device=device,
-            expert=expert,
-            watches=replays[size],
-        )
-        tables[size] = summarise_flights(flights, settings.seed)
-    flown = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
-    new = {str(size): {**flown, "rows": table} for size, table in tables.items()}
-    title = f"{run.path.name} in a world with {changes}" if changes else run.path.name
-    file = evaluation_file(run, changes)
-    entries = sorted({**read_tables(file), **new}.items(), key=lambda entry: int(entry[0]))
-    run.write(file.name, json.dumps(dict(entries), indent=2) + "\n")
-    run.write(file.with_suffix(".md").name, as_markdown(dict(entries), title))
-    print(f"\n{as_markdown(new, title)}", flush=True)
-    for size, recorders in replays.items():
-        page = file.with_name(file.stem.replace("evaluation", f"replay-{size}", 1) + ".html")
-        recordings = {name: recorder.recording() for name, recorder in recorders.items()}
-        write_replay(page, recordings, title, {"seed": settings.seed, "flock": f"1 of {settings.num_flocks}"})
-        print(f"A flight of {size} agents to watch in a browser: {page}", flush=True)
-    return tables
-
-
-def evaluation_file(run: RunFolder, changes: str = "") -> Path:
-    """Where the figures of an evaluation are, in the world of training or in a changed one; the table is beside them.
-
-    Args:
-        run: the run folder.
-        changes: ``name=value`` of all that was changed, separated by commas.
-    """
-    return run.path / (f"evaluation-{changes.replace('/', '_')}.json" if changes else "evaluation.json")
-
-
-def evaluate_run(config: EvaluateConfig) -> Path:
-    """Evaluate the policy of a run, in the world that it was trained in or in another.
-
-    Returns:
-        the file of figures.
-
-    Raises:
-        InputError: a bad setting, no such run, no readable policy in it, or no such device.
-    """
-    check(config)
-    prepare_torch(config.device, config.threads)
-    policy = load_policy(config.run, device=config.device, which=config.checkpoint)
-    run = RunFolder.open(config.run)
-    world, changes = changed_world(run, config.env)
-    sizes = as_list(config.evaluation.num_agents or world.num_agents)
-    best = {"checkpoint": "best"} if config.checkpoint == "best" else {}
-    named = ",".join(f"{name}={value}" for name, value in sorted({**changes, **best}.items()))
-    evaluate_policies(run, {run.config["model"]["name"]: policy}, world, config.evaluation, sizes, config.device, named)
-    return evaluation_file(run, named)
-
-
-def prepare_torch(device: str, threads: int) -> None:
-    """Choose the number of threads, keep TorchRL's notices off the terminal, and make sure that the device exists.
-
-    Raises:
-        InputError: there is no such device.
-    """
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
-    if threads:
-        torch.set_num_threads(threads)
-    try:
-        torch.zeros(1, device=device).item()
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise InputError(f"device={device} cannot be used ({reason}); device=cpu works everywhere") from error

@@ -7,13 +7,22 @@ invariant to translations and equivariant to rotations and reflections, whatever
 from __future__ import annotations
 
 import torch
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from modgnn_rl.nn.communication import GraphShift
+from modgnn_rl.models.blocks import VELOCITY_SCALE, LayerSpec, Zero, mlp
+from modgnn_rl.nn.modgnn import ModGNNLayer
 
-__all__ = ["Moments", "PairForce", "VectorSquash", "is_equivariant", "mlp"]
+__all__ = [
+    "SCALARS",
+    "VECTORS",
+    "Moments",
+    "PairForce",
+    "VectorSquash",
+    "moment_force",
+    "pair_force",
+]
 
-VELOCITY_SCALE = 1.4  # s/m
 SOFTENING = 1e-8
 MANY = 8.0  # sums over about this many neighbours are brought to order one
 
@@ -165,24 +174,6 @@ class VectorSquash(nn.Module):
         return torch.cat(((vectors / (1 + length)).flatten(-2), scalars / (1 + scalars.abs())), -1)
 
 
-def is_equivariant(module: nn.Module) -> bool:
-    """Whether a policy is known to turn with the world: all that its layers are made of says ``is_equivariant``."""
-    parts = [part for part in module.modules() if not list(part.children())]
-    inside = {part for holder in module.modules() if _says_so(holder) for part in holder.modules()}
-    return all(part in inside or isinstance(part, (nn.Identity, GraphShift)) for part in parts)
-
-
-def _says_so(module: nn.Module) -> bool:
-    return bool(getattr(module, "is_equivariant", False))
-
-
-def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    """Linear-ReLU-Linear-ReLU-Linear, the paper's three-layer network."""
-    return nn.Sequential(
-        nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs)
-    )
-
-
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """Inner products [...] of vectors with the component first [3, ...]."""
     return (a * b).sum(0)
@@ -191,3 +182,37 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 def _norm(vector: Tensor) -> Tensor:
     """Lengths [...] of vectors [3, ...], softened so that the gradient exists at zero."""
     return (_dot(vector, vector) + SOFTENING).sqrt()
+
+
+VECTORS, SCALARS = 4, 4  # the same of pair_force: 3 * 4 + 4 features
+
+
+def pair_force(spec: LayerSpec) -> ModGNNLayer:
+    """Equivariant forces of pairs as f_pre, summed over the neighbours: `PairForce`; hop 0 contributes nothing.
+
+    Layers before the last put out four vectors and four scalars, which later layers compare like velocities.
+    """
+    vectors, scalars = (VECTORS, SCALARS) if spec.head is None else (1, 0)
+    return _sum_of_forces(spec, vectors, scalars, features=(VECTORS, SCALARS))
+
+
+def moment_force(spec: LayerSpec) -> ModGNNLayer:
+    """`pair_force` over what the neighbours' own neighbourhoods look like: `Moments` in the layers before the last.
+
+    These have nothing to learn, so that an agent sees two links far and training costs little more than with one.
+    """
+    features = Moments.vectors, Moments.scalars
+    if spec.head is not None:
+        return _sum_of_forces(spec, 1, 0, features)
+    f_pre = [Zero(3 * Moments.vectors + Moments.scalars), *(Moments(spec.earlier) for _ in range(spec.hops))]
+    return ModGNNLayer(spec.hops, f_pre=f_pre, f_final=VectorSquash(Moments.vectors))
+
+
+def _sum_of_forces(spec: LayerSpec, vectors: int, scalars: int, features: tuple[int, int]) -> ModGNNLayer:
+    """A layer of `PairForce` in each hop, behind layers that put out ``features``."""
+    f_pre: list[nn.Module] = [Zero(3 * vectors + scalars)]
+    for _ in range(spec.hops):
+        force = PairForce(spec.hidden, vectors=vectors, scalars=scalars, earlier=spec.earlier, features=features)
+        f_pre.append(TensorDictModule(force, in_keys=["data", "input"], out_keys=["data"]))
+    f_final = VectorSquash(vectors) if spec.head is None else spec.head
+    return ModGNNLayer(spec.hops, f_pre=f_pre, f_final=f_final)

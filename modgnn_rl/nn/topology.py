@@ -11,7 +11,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.nn.graph import Graph, Links, Pairs
 from modgnn_rl.utils.tensors import is_transformed, places_of
 
-__all__ = ["FORMS", "Topology"]
+__all__ = ["FORMS", "Topology", "as_matrix", "reachable"]
 
 FORMS = ("auto", "links", "pairs")
 FEW_PAIRS = 2048  # up to here computing all pairs costs no more than listing the links
@@ -235,3 +235,18 @@ def _check_numbers(edges: Tensor, num_agents: int) -> None:
             f"an edge list of {num_agents} agents names agent {int(edges.max())} or {int(edges.min())}; expected "
             f"numbers from 0 to {num_agents - 1}, and -1 for both ends of what only fills up the list"
         )
+
+
+def as_matrix(adjacency: Tensor, num_agents: int) -> Tensor:
+    """A graph as a bool matrix [..., N, N], from any form that `modgnn_rl.nn.topology.Topology` reads."""
+    graph = Topology(adjacency, num_agents, form="pairs").everyone()
+    assert isinstance(graph, Pairs)
+    return graph.mask.view(*adjacency.shape[:-2], num_agents, num_agents)
+
+
+def reachable(adjacency: Tensor, hops: int) -> Tensor:
+    """Who hears of whom over at most ``hops`` >= 1 links; bool [..., N, N] -> bool [..., N, N], zero diagonal."""
+    reached = adjacency
+    for _ in range(hops - 1):
+        reached = reached | ((adjacency.float() @ reached.float()) > 0)
+    return reached & ~torch.eye(adjacency.shape[-1], dtype=torch.bool, device=adjacency.device)

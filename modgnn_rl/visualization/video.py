@@ -18,9 +18,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.flocking.expert import as_matrix
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import endless_env
+from modgnn_rl.nn.topology import as_matrix
 
 __all__ = ["Frame", "as_gif", "check_video", "film", "write_video"]
 

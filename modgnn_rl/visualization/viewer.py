@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.flocking.expert import as_matrix
 from modgnn_rl.errors import InputError
+from modgnn_rl.nn.topology import as_matrix
 
 __all__ = ["Viewer"]
 

@@ -17,7 +17,8 @@ import torch
 from tensordict import TensorDict
 
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
-from modgnn_rl.data import collect, manifest
+from modgnn_rl.data import collect as collect_module
+from modgnn_rl.data import manifest
 from modgnn_rl.data.collect import collect, fly_expert, report
 from modgnn_rl.data.dataset import FlightDataset
 from modgnn_rl.data.manifest import MANIFEST, STATE, Manifest
@@ -110,7 +111,7 @@ def test_ctrl_c_says_how_far_it_got(
             raise KeyboardInterrupt
         return real(env, *arguments)
 
-    monkeypatch.setattr(collect, "fly_expert", interrupted)
+    monkeypatch.setattr(collect_module, "fly_expert", interrupted)
     with pytest.raises(KeyboardInterrupt):
         collect(config(tmp_path / "set"))
     assert "has 2 of 3 shards, and the same command goes on from there" in capsys.readouterr().err

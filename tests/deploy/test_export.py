@@ -344,7 +344,7 @@ def test_a_full_disk_leaves_the_older_export(broken: str, tmp_path: Path, monkey
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(exporting, broken, full)
+        patch.setattr(export, broken, full)
         with pytest.raises(InputError, match=r"cannot write .*No space left on device"):
             export.write_folder(tmp_path / "agent", {"agent.json": b"new"})
     assert {file.name: file.read_bytes() for file in (tmp_path / "agent").iterdir()} == {

@@ -26,12 +26,14 @@ from modgnn_rl.configs.schema import (
 )
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.experiment.training import evaluate_run, prepare_torch, train
+from modgnn_rl.experiment.evaluate import evaluate_run
+from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.train import main
 from modgnn_rl.trainers.loop import dashboard_callback
 from modgnn_rl.trainers.loop.callbacks import Callback
+from modgnn_rl.utils.device import prepare_torch
 
 SMALL = {"num_envs": 2, "batch_size": 16, "capacity": 400}
 

@@ -28,17 +28,9 @@ from modgnn_rl.configs.schema import (
 )
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import train
+from modgnn_rl.models.blocks import BallHead, LayerSpec, Scale
 from modgnn_rl.models.equivariant import VectorSquash
-from modgnn_rl.models.registry import (
-    MODELS,
-    BallHead,
-    LayerSpec,
-    PairForce,
-    Scale,
-    configured_model,
-    make_model,
-    register_model,
-)
+from modgnn_rl.models.registry import MODELS, PairForce, configured_model, make_model, register_model
 from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
 
 seeds = st.integers(0, 999)

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig
-from modgnn_rl.envs.flocking.expert import as_matrix
 from modgnn_rl.envs.flocking.recording import METRICS, QUANTUM, Recorder, Recording, spacing
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import fly, reference_policies
-from modgnn_rl.experiment.replay import record
+from modgnn_rl.nn.topology import as_matrix
 from modgnn_rl.replay import refuse
 from modgnn_rl.visualization import html
+from modgnn_rl.visualization.recording import record
 
 sys.path.insert(0, str(Path(__file__).parent))
 browser = importlib.import_module("browser")

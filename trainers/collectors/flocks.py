@@ -3,128 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torchrl.collectors import Collector
+from tensordict.nn import TensorDictModuleBase
 from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRobinWriter
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, CollectorConfig, FlockingConfig, ImitationConfig, TrainConfig
-from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.models.equivariant import is_equivariant
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.trainers.collectors.behaviour import Disturbance, Ensemble, Mixture, SafetyGate, spread
-from modgnn_rl.trainers.collectors.remote import RemoteFlights
+from modgnn_rl.trainers.collectors.local import make_flights
+from modgnn_rl.trainers.collectors.windows import as_windows, reservoir_places, window_of
 from modgnn_rl.trainers.common.state import Part, Tensors
-from modgnn_rl.trainers.imitation.loss import are_alike
-from modgnn_rl.utils.seeds import derive_seed, seeded
+from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = [
-    "FlockCollector",
     "Flocks",
-    "as_windows",
     "flocks_of",
     "flocks_of_all_sizes",
-    "make_flights",
     "named_flocks",
-    "reservoir_places",
-    "stores_messages",
     "validation_flocks",
-    "window_of",
 ]
-
-
-class FlockCollector:
-    """Flocks of one size that never stop flying, flown through TorchRL's `Collector`.
-
-    Each call of `continue_flights` goes on where they were.
-
-    Args:
-        config: the world.
-        num_envs: flocks flown at once, B.
-        num_agents: agents in each, N.
-        behaviour: the modules that fly and label, in this order (weights changed in place are flown at once).
-        steps: steps of one call of `continue_flights`.
-        seed: seeds the environment, and the draws of modules that draw from torch's global generator.
-        device: where flocks and data live.
-    """
-
-    def __init__(
-        self,
-        config: FlockingConfig,
-        num_envs: int,
-        num_agents: int,
-        behaviour: Sequence[TensorDictModuleBase],
-        *,
-        steps: int,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.env = FlockingEnv(
-            num_envs, num_agents, config=config, seed=derive_seed(seed, "env"), device=device, stagger=True
-        )
-        self.noise = torch.Generator().manual_seed(derive_seed(seed, "noise"))
-        with seeded(seed, device):  # the collector tries the policy out
-            self.collector = Collector(
-                self.env,
-                TensorDictSequential(*behaviour),
-                frames_per_batch=num_envs * steps,
-                total_frames=-1,
-                auto_register_policy_transforms=True,
-                trust_policy=True,
-                no_cuda_sync=True,
-            )
-        self._flights: Iterator[TensorDictBase] = iter(self.collector)
-
-    @torch.no_grad()
-    def continue_flights(self) -> TensorDictBase:
-        """Continue the flights by some steps; flights [B, T]. Torch's global generators are left as they were."""
-        seed = int(torch.randint(2**31, (), generator=self.noise))
-        with seeded(seed, self.env.device):
-            return next(self._flights)
-
-    @property
-    def generators(self) -> dict[str, torch.Generator]:
-        """All that draws at random here, by name."""
-        return {"env": self.env.generator, "faults": self.env.faults.generator, "noise": self.noise}
-
-    def state(self) -> tuple[Tensors, dict[str, Any]]:
-        """What a checkpoint holds of the flights."""
-        # TorchRL has no public name for what it carries from step to step, messages among it; its own numbers of
-        # trajectories need not be the same.
-        carried = self.collector._carrier.exclude("collector").flatten_keys("/")
-        return {"env": self.env.snapshot(), "carried": dict(carried.items())}, {}
-
-    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
-        """Go on from what `state` gave.
-
-        Raises:
-            KeyError, RuntimeError: these are flights of other flocks.
-        """
-        self.env.restore(tensors["env"])
-        carried = self.collector._carrier
-        found = TensorDict(tensors["carried"], carried.batch_size, device=self.env.device).unflatten_keys("/")
-        self.collector._carrier = carried.select("collector").update(found)
-
-    def close(self) -> None:
-        """End the flights."""
-        self.collector.shutdown()
-
-
-def make_flights(
-    collector: CollectorConfig | None, config: FlockingConfig, *arguments: Any, **options: Any
-) -> FlockCollector | RemoteFlights:
-    """Flocks of one size, flown in this process (also for None) or by workers; for the arguments see `FlockCollector`.
-
-    Raises:
-        InputError: see `RemoteFlights`.
-    """
-    if collector is None or collector.name == "single":
-        return FlockCollector(config, *arguments, **options)
-    return RemoteFlights(config, *arguments, **options, collector=collector)
 
 
 class Flocks:
@@ -259,37 +160,6 @@ class Flocks:
         self.flights.close()
 
 
-def reservoir_places(
-    seen: int, count: int, capacity: int, generator: torch.Generator
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Reservoir sampling (Vitter 1985): which of new items replace which, so that all ever seen are kept alike.
-
-    Args:
-        seen: items seen before, at least ``capacity``.
-        count: new items.
-        capacity: items kept.
-        generator: source of randomness.
-
-    Returns:
-        places in the store, and the new items that go there, int64 [R] each; no place comes twice.
-    """
-    items = torch.arange(count)
-    chance = torch.rand(count, generator=generator, dtype=torch.float64)
-    drawn = (chance * (seen + items + 1)).long()
-    stays = drawn < capacity
-    place, item = drawn[stays], items[stays]
-    last = torch.full((capacity,), -1).scatter_reduce(0, place, item, "amax")  # a later item goes over an earlier one
-    place = (last >= 0).nonzero().squeeze(-1)
-    return place, last[place]
-
-
-def window_of(policies: Sequence[ModGNN], settings: ImitationConfig) -> int:
-    """Steps of the windows that policies learn from: one, with the stored messages, where that is enough."""
-    if are_alike(policies) and stores_messages(policies[0]) and not settings.hide_velocity:
-        return 1
-    return max(policy.window for policy in policies)
-
-
 def flocks_of_all_sizes(
     config: TrainConfig,
     policies: Sequence[ModGNN],
@@ -343,22 +213,6 @@ def named_flocks(training: Mapping[int, Part], validation: Mapping[int, Part]) -
     }
 
 
-def stores_messages(policy: ModGNN) -> bool:
-    """Whether a policy is trained with the messages that it received in flight; if not, windows make them anew.
-
-    They must hold no trace of a parameter, and turn with a rotated state: as sums of observations do, and as all does
-    that an equivariant policy sends, whose states need no rotation.
-    """
-    return policy.sends_plain_data and (len(policy.layers) == 1 or is_equivariant(policy))
-
-
 def flocks_of(size: int, config: TrainConfig) -> int:
     """How many flocks of a size a run flies at once, so that each size has as many agents."""
     return max(1, round(REFERENCE_SIZE * config.trainer.num_envs / len(config.env.sizes) / size))
-
-
-def as_windows(flights: TensorDictBase, length: int, every: int) -> TensorDictBase:
-    """Cut flights [B, T] into overlapping windows [B * n, length] whose last steps are ``every`` steps apart."""
-    last = torch.arange(length - 1, flights.shape[1], every, device=flights.device)
-    steps = last.unsqueeze(-1) + torch.arange(1 - length, 1, device=flights.device)
-    return flights[:, steps].flatten(0, 1)

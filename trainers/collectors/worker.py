@@ -33,7 +33,7 @@ class Flight:
     """What a worker flies; sent to it when it starts.
 
     Attributes:
-        config, num_envs, num_agents, steps, seed, device: see `modgnn_rl.trainers.collectors.flocks.FlockCollector`.
+        config, num_envs, num_agents, steps, seed, device: see `modgnn_rl.trainers.collectors.local.FlockCollector`.
         behaviour: the modules that fly and label, made by `packed`.
     """
 

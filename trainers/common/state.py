@@ -10,7 +10,7 @@ from torch import Tensor
 
 from modgnn_rl.tracking.checkpoint import Checkpoint
 
-__all__ = ["Part", "Tensors", "gather", "scatter"]
+__all__ = ["Part", "Tensors", "gather", "moments_of", "restore_moments", "scatter"]
 
 Tensors = dict[str, dict[str, Tensor]]
 
@@ -74,3 +74,18 @@ def _under(prefix: str, named: Mapping[str, Any]) -> dict[str, Any]:
     """The entries of one part, by the names that it gave them."""
     length = len(prefix)
     return {name[length:]: value for name, value in named.items() if name[: name.rfind(".") + 1] == prefix}
+
+
+def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """What an optimiser remembers of each parameter, as named tensors."""
+    entries = optimizer.state_dict()["state"].items()
+    return {f"{index}.{name}": value for index, entry in entries for name, value in entry.items()}
+
+
+def restore_moments(optimizer: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
+    """Let an optimiser remember what `moments_of` gave."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in moments.items():
+        index, _, name = key.partition(".")
+        state.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
@@ -15,23 +15,17 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ImitationConfig
-from modgnn_rl.models.equivariant import is_equivariant
+from modgnn_rl.models.blocks import is_equivariant
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.trainers.collectors.windows import are_alike
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.optimization import Stepper
-from modgnn_rl.trainers.common.state import Tensors
-from modgnn_rl.trainers.imitation.loss import (
-    are_alike,
-    hide_velocities,
-    imitation_loss,
-    random_receivers,
-    random_rotations,
-    rotate,
-    stacked_losses,
-)
+from modgnn_rl.trainers.common.sampling import random_receivers
+from modgnn_rl.trainers.common.state import Tensors, moments_of, restore_moments
+from modgnn_rl.trainers.imitation.loss import hide_velocities, imitation_loss, random_rotations, rotate, stacked_losses
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["Learner", "cosine_learning_rate", "fit_together", "moments_of", "restore_moments", "validate_together"]
+__all__ = ["Learner", "cosine_learning_rate", "fit_together", "validate_together"]
 
 STACKED_PAIRS = 2048  # up to this many pairs of agents in a batch, several seeds learn faster as one
 
@@ -148,21 +142,6 @@ class Learner:
         self.scheduler.last_epoch = int(values["scheduled"])
         rate = self.optimizer.param_groups[0]["lr"] = self.scheduler.lr_lambdas[0](self.scheduler.last_epoch)
         self.scheduler._last_lr = [rate]
-
-
-def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """What an optimiser remembers of each parameter, as named tensors."""
-    entries = optimizer.state_dict()["state"].items()
-    return {f"{index}.{name}": value for index, entry in entries for name, value in entry.items()}
-
-
-def restore_moments(optimizer: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
-    """Let an optimiser remember what `moments_of` gave."""
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in moments.items():
-        index, _, name = key.partition(".")
-        state.setdefault(int(index), {})[name] = value
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
 def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int) -> list[float]:

@@ -14,10 +14,8 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl.nn.modgnn import ModGNN
 
 __all__ = [
-    "are_alike",
     "hide_velocities",
     "imitation_loss",
-    "random_receivers",
     "random_rotations",
     "rotate",
     "stacked_losses",
@@ -98,25 +96,11 @@ def hide_velocities(batch: TensorDictBase, share: float, generator: torch.Genera
     batch["agents", "observation"] = observation.masked_fill(hidden, 0.0)
 
 
-def are_alike(policies: Sequence[ModGNN]) -> bool:
-    """Whether policies differ in their weights only."""
-    return len({str(policy) + str([value.shape for value in policy.state_dict().values()]) for policy in policies}) == 1
-
-
 def _at_the_end(actions: Tensor, receivers: Tensor) -> Tensor:
     """The receivers [S, N] at the last step of windows, which actions [S, W, N, A] are of; bool [S, W, N]."""
     wanted = torch.zeros_like(actions[..., 0], dtype=torch.bool)
     wanted[:, -1] = receivers
     return wanted
-
-
-def random_receivers(controlled: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Choose ``count`` of the controlled agents of each flock, or all where there are fewer; bool [S, N] -> [S, N]."""
-    lot = torch.rand(controlled.shape, generator=generator, device=generator.device).to(controlled.device)
-    lot = lot.masked_fill(~controlled, 2.0)
-    chosen = torch.zeros_like(controlled)
-    chosen.scatter_(-1, lot.topk(min(count, controlled.shape[-1]), largest=False).indices, True)
-    return chosen & controlled
 
 
 def random_rotations(count: int, like: Tensor, generator: torch.Generator) -> Tensor:

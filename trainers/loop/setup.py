@@ -22,8 +22,9 @@ from modgnn_rl.models.registry import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.loading import load_policy, stored_model
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.collectors.flocks import flocks_of, window_of
+from modgnn_rl.trainers.collectors.flocks import flocks_of
 from modgnn_rl.trainers.collectors.remote import check_collector
+from modgnn_rl.trainers.collectors.windows import window_of
 from modgnn_rl.trainers.imitation.learner import Learner
 from modgnn_rl.trainers.ppo.learner import improvement_window
 from modgnn_rl.utils.seeds import derive_seed

@@ -19,7 +19,8 @@ from modgnn_rl.configs.schema import TrainerConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.checkpoint import save_checkpoint
-from modgnn_rl.trainers.collectors.flocks import FlockCollector, Flocks
+from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.collectors.local import FlockCollector
 from modgnn_rl.trainers.collectors.remote import RemoteFlights
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.state import Part, gather, scatter

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from modgnn_rl.models.equivariant import mlp
+from modgnn_rl.models.blocks import mlp
 from modgnn_rl.utils.tensors import pair_distances
 
 __all__ = ["FlockCritic", "PooledCritic", "flock_features"]

@@ -136,7 +136,7 @@ class Flocks:
         return self.renderers[flock].draw(drawn)
 
     def _matrix(self) -> torch.Tensor:
-        from modgnn_rl.envs.flocking.expert import as_matrix
+        from modgnn_rl.nn.topology import as_matrix
 
         return as_matrix(self.adjacency, self.env.num_agents)
 

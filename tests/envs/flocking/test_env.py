@@ -18,11 +18,12 @@ from modgnn_rl import configs
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.envs import FlockingEnv, TorchPhysics
-from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds, as_matrix
+from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
 from modgnn_rl.envs.flocking.leader import NoiseLeader
 from modgnn_rl.envs.flocking.rewards import flocking_costs, flocking_reward, reward_weights
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.registry import make_model
+from modgnn_rl.nn.topology import as_matrix
 from modgnn_rl.utils.tensors import pair_distances
 
 NAN = math.nan

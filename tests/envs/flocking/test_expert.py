@@ -14,8 +14,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds, as_matrix, reachable, reynolds
+from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds, reynolds
 from modgnn_rl.errors import InputError
+from modgnn_rl.nn.topology import as_matrix, reachable
 from modgnn_rl.utils.tensors import PAIRS_IN_BLOCK
 
 GAINS: dict[str, Any] = {"cohesion": 0.06, "separation": 0.8, "alignment": 0.02}

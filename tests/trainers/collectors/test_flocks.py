@@ -10,7 +10,8 @@ from torch import nn
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds, reynolds
-from modgnn_rl.trainers.collectors.flocks import Flocks, as_windows, flocks_of_all_sizes
+from modgnn_rl.trainers.collectors.flocks import Flocks, flocks_of_all_sizes
+from modgnn_rl.trainers.collectors.windows import as_windows
 
 
 def _flocks(policy, *, seed=0, steps=10, every=2, **world):

@@ -23,7 +23,7 @@ from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
 from modgnn_rl.trainers.collectors.behaviour import Disturbance, Ensemble, Mixture
-from modgnn_rl.trainers.collectors.flocks import FlockCollector
+from modgnn_rl.trainers.collectors.local import FlockCollector
 from modgnn_rl.trainers.collectors.remote import RemoteFlights, check_collector
 from modgnn_rl.trainers.collectors.worker import packed
 from modgnn_rl.trainers.ppo.actor import GaussianActor

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import Flocks, reservoir_places
+from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.collectors.windows import reservoir_places
 
 
 @given(capacity=st.integers(1, 12), seen=st.integers(0, 30), count=st.integers(0, 40), seed=st.integers(0, 1000))

@@ -28,10 +28,12 @@ from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.collectors.flocks import FlockCollector, Flocks
+from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.collectors.local import FlockCollector
 from modgnn_rl.trainers.common import distributed
+from modgnn_rl.trainers.common.sampling import random_receivers
 from modgnn_rl.trainers.imitation.learner import Learner
-from modgnn_rl.trainers.imitation.loss import imitation_loss, random_receivers
+from modgnn_rl.trainers.imitation.loss import imitation_loss
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.trainers.ppo.learner import Improver

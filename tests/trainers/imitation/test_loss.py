@@ -11,15 +11,10 @@ from tensordict import TensorDict
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import Flocks, as_windows, stores_messages, window_of
-from modgnn_rl.trainers.imitation.loss import (
-    hide_velocities,
-    imitation_loss,
-    random_receivers,
-    random_rotations,
-    rotate,
-    stacked_losses,
-)
+from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.collectors.windows import as_windows, stores_messages, window_of
+from modgnn_rl.trainers.common.sampling import random_receivers
+from modgnn_rl.trainers.imitation.loss import hide_velocities, imitation_loss, random_rotations, rotate, stacked_losses
 
 FLOCKS, AGENTS = 5, 7
 

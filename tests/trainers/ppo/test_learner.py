@@ -12,7 +12,7 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig, MAPPOConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import FlockCollector
+from modgnn_rl.trainers.collectors.local import FlockCollector
 from modgnn_rl.trainers.ppo.learner import RECEIVERS, Improver
 
 WORLD = FlockingConfig(max_steps=8)  # flights end in the middle of the rounds
