@@ -23,8 +23,8 @@ _HOMES = {
     "ModGNN": "modgnn_rl.nn.modgnn",
     "ModGNNLayer": "modgnn_rl.nn.modgnn",
     "load_policy": "modgnn_rl.tracking.loading",
-    "make_model": "modgnn_rl.models",
-    "register_model": "modgnn_rl.models",
+    "make_model": "modgnn_rl.models.registry",
+    "register_model": "modgnn_rl.models.registry",
 }
 
 

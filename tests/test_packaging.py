@@ -59,13 +59,15 @@ def test_links_lead_to_the_folders_that_setuptools_maps(folder: str) -> None:
 
 
 def test_package_data_covers_every_file_that_is_not_code() -> None:
-    for folder, package in [("modgnn_rl", "modgnn_rl"), *((folder, f"modgnn_rl.{folder}") for folder in LINKED)]:
-        patterns = SETUPTOOLS["package-data"].get(package, [])
-        covered = {path for pattern in patterns for path in (ROOT / folder).glob(pattern)}
-        data = {path for path in (ROOT / folder).rglob("*") if path.is_file() and path.suffix not in {".py", ".pyc"}}
-        assert {
-            path for path in data if not path.is_relative_to(ROOT / "modgnn_rl") or package == "modgnn_rl"
-        } == covered
+    covered = {
+        path
+        for package, patterns in SETUPTOOLS["package-data"].items()
+        for pattern in patterns
+        for path in (ROOT / "modgnn_rl" / Path(*package.split(".")[1:])).glob(pattern)
+    }
+    folders = [ROOT / "modgnn_rl", *(ROOT / "modgnn_rl" / folder for folder in LINKED)]
+    files = {path for folder in folders for path in folder.rglob("*") if path.is_file()}
+    assert {path for path in files if path.suffix not in {".py", ".pyc"}} == covered
 
 
 def test_nothing_imports_the_folders_by_their_bare_names() -> None:

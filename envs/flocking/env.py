@@ -36,8 +36,9 @@ AWAY = 1e4  # m; where agents that do not exist are kept, as far from each other
 class FlockingEnv(EnvBase):
     """Flocks of quadcopters behind a leader, as a batch-locked TorchRL environment.
 
-    Agent 0 is the leader: whatever the policy says, it flies as `modgnn_rl.envs.flocking.leader` tells it. Nothing in its
-    observation marks it. The others fly at the policy's target velocities, projected onto the ball of ``max_speed``.
+    Agent 0 is the leader: whatever the policy says, it flies as `modgnn_rl.envs.flocking.leader` tells it. Nothing in
+    its observation marks it. The others fly at the policy's target velocities, projected onto the ball of
+    ``max_speed``.
 
     Keys, with B flocks and N agents:
 

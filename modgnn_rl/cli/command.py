@@ -4,7 +4,8 @@ A command is a function of one dataclass::
 
     def main(config: TrainConfig) -> None:
         \"\"\"Train a flock.\"\"\"
-        from modgnn_rl.experiment.training import train  # heavy imports only now: a typing error must be reported at once
+        from modgnn_rl.experiment.training import train  # heavy imports only now: a typing error must be reported at
+        once
 
         train(config)
 

@@ -24,7 +24,8 @@ FIRST = {
 def commands() -> dict[str, str]:
     """The first sentence of each command's docstring, by its name.
 
-    Read from the files, where whatever calls `modgnn_rl.cli.command.run_command` is a command: importing them takes long.
+    Read from the files, where whatever calls `modgnn_rl.cli.command.run_command` is a command: importing them takes
+    long.
     """
     found = {}
     for path in sorted(ROOT.glob("*.py")):

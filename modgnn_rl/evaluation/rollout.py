@@ -139,7 +139,8 @@ def fly(
         device: where to fly.
         progress: counts flock-steps.
         expert: what errors are measured against, writes ``("agents", "expert_action")``; default: Reynolds flocking.
-        watch: is shown the flocks before each step, with both actions; see `modgnn_rl.envs.flocking.recording.Recorder`.
+        watch: is shown the flocks before each step, with both actions; see
+            `modgnn_rl.envs.flocking.recording.Recorder`.
     """
     env = endless_env(policy, config, num_flocks, num_agents, steps=steps, seed=seed, device=device)
     expert = expert or Reynolds.for_env(config)

@@ -65,7 +65,8 @@ class ModGNNLayer(nn.Module):
     Args:
         hops: number of hops K >= 0.
         f_input: encodes the observation.
-        f_com: what an agent makes of one incoming message, see `modgnn_rl.nn.communication`; one module for all hops, or
+        f_com: what an agent makes of one incoming message, see `modgnn_rl.nn.communication`; one module for all hops,
+            or
             a list of K. Default: the Laplacian, incoming minus own.
         f_pre: applied to each incoming datum before the sum over neighbours; one module for all hops, or a list of
             K + 1 (``None`` in it is the identity).

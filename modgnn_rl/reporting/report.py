@@ -35,7 +35,8 @@ class Figure:
 
     Attributes:
         name: name of its files ``figures/<name>.svg`` and ``.png``: letters, digits and ``_ . + -``; used once.
-        draw: draws onto an empty matplotlib figure, see `modgnn_rl.reporting.plots`. It is called twice, with a wide figure for
+        draw: draws onto an empty matplotlib figure, see `modgnn_rl.reporting.plots`. It is called twice, with a wide
+            figure for
             the page and for papers and with a narrow one for phones.
         caption: what is to be seen; screen readers read it in place of the figure.
     """

@@ -56,10 +56,10 @@ class Killed(BaseException):
 
 
 STOPS: list[tuple[Any, str]] = [
-    (collect, "fly_expert"),
-    (collect, "fsync_file"),
+    (collect_module, "fly_expert"),
+    (collect_module, "fsync_file"),
     (os, "replace"),
-    (collect, "describe_files"),
+    (collect_module, "describe_files"),
     (manifest, "write_atomically"),
     (TensorDict, "memmap"),
 ]

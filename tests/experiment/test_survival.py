@@ -1,4 +1,6 @@
-"""Runs that are killed, on disks that are full, and files that are damaged: `pytest -m slow tests/experiment/test_survival.py`."""
+"""Runs that are killed, on disks that are full, and files that are damaged: `pytest -m slow
+tests/experiment/test_survival.py`.
+"""
 
 from __future__ import annotations
 

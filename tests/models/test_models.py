@@ -227,7 +227,7 @@ def test_a_model_of_ones_own_is_trained_and_loaded_by_its_name(own_names: None, 
 
 
 def test_an_installed_package_brings_models(own_names: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = EntryPoint("plugged", "modgnn_rl.models:gcn", MODEL_PLUGINS)
+    entry = EntryPoint("plugged", "modgnn_rl.models.paper:gcn", MODEL_PLUGINS)
     monkeypatch.setattr("modgnn_rl.models.registry.entry_points", lambda **_: EntryPoints([entry]))
     assert make_model("plugged", seed=0).state_dict().keys() == make_model("gcn").state_dict().keys()
     assert "plugged" in MODEL_NAMES

@@ -21,7 +21,7 @@ from modgnn_rl.replay import refuse
 from modgnn_rl.visualization import html
 from modgnn_rl.visualization.recording import record
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 browser = importlib.import_module("browser")
 
 needs_chromium = pytest.mark.skipif(

@@ -63,9 +63,9 @@ def check_collector(config: CollectorConfig, num_envs: int) -> None:
 class RemoteFlights:
     """Flocks of one size that workers fly, each a part of them, in step with each other.
 
-    What `modgnn_rl.trainers.collectors.local.FlockCollector` does in this process, with the same data. The first worker's
-    flocks are those of a `FlockCollector` with the seed ``derive_seed(seed, "worker", 0)``, and so on. A worker that
-    dies, or does not answer, is replaced, and its flocks begin anew; a warning says so.
+    What `modgnn_rl.trainers.collectors.local.FlockCollector` does in this process, with the same data. The first
+    worker's flocks are those of a `FlockCollector` with the seed ``derive_seed(seed, "worker", 0)``, and so on. A
+    worker that dies, or does not answer, is replaced, and its flocks begin anew; a warning says so.
 
     Args:
         config: the world.

@@ -1,6 +1,7 @@
 """Cascaded velocity controller of a quadcopter: target velocity in, thrust and torque out.
 
-On structures of arrays, see `modgnn_rl.envs.flocking.physics.vectors`. The gains are tuned for a Crazyflie 2.X at 48 Hz.
+On structures of arrays, see `modgnn_rl.envs.flocking.physics.vectors`. The gains are tuned for a Crazyflie 2.X at 48
+Hz.
 """
 
 from __future__ import annotations

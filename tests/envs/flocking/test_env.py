@@ -426,7 +426,7 @@ def test_what_is_worth_it_is_compiled(how: str, monkeypatch: pytest.MonkeyPatch)
         names.append(function.__name__)
         return function
 
-    for module in ("flocking", "physics"):
+    for module in ("flocking.env", "flocking.physics.engine"):
         monkeypatch.setattr(f"modgnn_rl.envs.{module}.compiled", record)
     if how == "setting":
         env = FlockingEnv(2, 3, seed=0, compile=True)

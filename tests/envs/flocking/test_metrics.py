@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from modgnn_rl.envs.flocking.env import metrics
+from modgnn_rl.envs.flocking import metrics
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils import tensors
 

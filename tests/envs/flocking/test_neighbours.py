@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from modgnn_rl.envs.flocking.env import neighbours
+from modgnn_rl.envs.flocking import neighbours
 from modgnn_rl.envs.flocking.neighbours import link_list, near_pairs
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.tensors import PAIRS_IN_BLOCK, pair_distances
