@@ -2,8 +2,8 @@
 
     python benchmarks/collector_speed.py
 
-Flights of moment_force with the expert's labels, as a training run makes them; 32 flocks of 32 agents, two workers, one
-thread each. The collectors take turns; medians.
+Rollouts of moment_force with the expert's labels, as a training run makes them; 32 flocks of 32 agents, two workers,
+one thread each. The collectors take turns; medians.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.trainers.collectors.local import FlockCollector
-from modgnn_rl.trainers.collectors.remote import RemoteFlights
+from modgnn_rl.trainers.collectors.remote import RemoteCollector
 from modgnn_rl.utils.device import prepare_torch
 
 FLOCKS, AGENTS, STEPS, WORKERS = 32, 32, 40, 2
 REPETITIONS = 5
 
 
-def make(name: str, physics: str) -> FlockCollector | RemoteFlights:
+def make(name: str, physics: str) -> FlockCollector | RemoteCollector:
     """Flocks of one collector."""
     flown = (make_model("moment_force", seed=0), Reynolds())
-    world = FlockingConfig(physics=physics)
+    env_config = FlockingConfig(physics=physics)
     if name == "single":
-        return FlockCollector(world, FLOCKS, AGENTS, flown, steps=STEPS, seed=0)
+        return FlockCollector(env_config, FLOCKS, AGENTS, flown, steps=STEPS, seed=0)
     workers = CollectorConfig(name, workers=WORKERS)
-    return RemoteFlights(world, FLOCKS, AGENTS, flown, steps=STEPS, seed=0, collector=workers)
+    return RemoteCollector(env_config, FLOCKS, AGENTS, flown, steps=STEPS, seed=0, collector=workers)
 
 
 def speeds(names: list[str], physics: str) -> dict[str, float]:
@@ -44,7 +44,7 @@ def speeds(names: list[str], physics: str) -> dict[str, float]:
         for _ in range(REPETITIONS + 1):  # the first starts them
             for name, collector in collectors.items():
                 start = time.perf_counter()
-                collector.continue_flights()
+                collector.collect()
                 times[name].append(time.perf_counter() - start)
     finally:
         for collector in collectors.values():

@@ -80,7 +80,7 @@ def sparse_modgnn(dense: DenseModGNN) -> ModGNN:
 
 
 def random_step(flocks: int, agents: int, hops: int, share: float = SHARE) -> TensorDict:
-    """Observations, graphs and messages of one step in mid-flight."""
+    """Observations, graphs and messages of one step in mid-rollout."""
     generator = torch.Generator().manual_seed(0)
     linked = torch.rand(flocks, agents, agents, generator=generator) < share
     return TensorDict(
@@ -195,25 +195,25 @@ WITHOUT: Mapping[str, Callable[[], contextlib.AbstractContextManager[object]]] =
 
 
 def windows_table() -> None:
-    """Print the time of whole flights in recurrent mode against that of rebuilding the window of every step."""
-    header("16 flights of 64 steps, 32 agents", "rebuilt windows, ms", "scanned, ms", "times faster")
+    """Print the time of whole rollouts in recurrent mode against that of rebuilding the window of every step."""
+    header("16 rollouts of 64 steps, 32 agents", "rebuilt windows, ms", "scanned, ms", "times faster")
     for hops in HOPS:
         torch.manual_seed(0)
         policy = sparse_modgnn(DenseModGNN(hops))
         step = random_step(16, 32, hops).exclude("messages")
-        flights: Any = torch.cat([step.unsqueeze(1)] * 64, 1)
-        flights["is_init"][:, 0] = True
+        rollouts: Any = torch.cat([step.unsqueeze(1)] * 64, 1)
+        rollouts["is_init"][:, 0] = True
 
-        def scan(policy: ModGNN = policy, flights: TensorDict = flights) -> Tensor:
+        def scan(policy: ModGNN = policy, rollouts: TensorDict = rollouts) -> Tensor:
             with set_recurrent_mode(True):
-                return action_of(policy, flights)
+                return action_of(policy, rollouts)
 
-        def rebuild(policy: ModGNN = policy, flights: TensorDict = flights, hops: int = hops) -> Tensor:
+        def rebuild(policy: ModGNN = policy, rollouts: TensorDict = rollouts, hops: int = hops) -> Tensor:
             steps = torch.arange(hops, 64).unsqueeze(-1) + torch.arange(-hops, 1)
             wanted = torch.zeros(16 * (64 - hops), hops + 1, 32, dtype=torch.bool)
             wanted[:, -1] = True
             with set_recurrent_mode(True):
-                windows = flights[:, steps].flatten(0, 1)
+                windows = rollouts[:, steps].flatten(0, 1)
                 return policy(windows, receivers=wanted)["agents", "action"][:, -1]
 
         torch.testing.assert_close(scan()[:, hops:].flatten(0, 1), rebuild(), rtol=1e-4, atol=1e-5)

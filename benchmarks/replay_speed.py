@@ -1,4 +1,4 @@
-"""Frames a second of a replay in a headless Chromium that draws in software, at the pace of the flight.
+"""Frames a second of a replay in a headless Chromium that draws in software, at the pace of the rollout.
 
 ``python benchmarks/replay_speed.py <replay.html> [<another.html> ...]``
 """
@@ -21,7 +21,7 @@ COUNT = f"""new Promise((done) => {{
 
 
 def main() -> None:
-    """Print size and speed of each page, with two flights and with one."""
+    """Print size and speed of each page, with two rollouts and with one."""
     if browser.CHROMIUM is None or not sys.argv[1:]:
         sys.exit(f"{__doc__}\nIt takes a Chromium on the PATH.")
     for page in map(Path, sys.argv[1:]):
@@ -29,7 +29,7 @@ def main() -> None:
             window.open(page.resolve().as_uri())
             window.wait("state.drawn > 1")
             speeds = []
-            for both in window.run("content.flights.length > 1 ? [true, false] : [false]"):
+            for both in window.run("content.rollouts.length > 1 ? [true, false] : [false]"):
                 window.run(f"if (state.both !== {str(both).lower()}) toggle('both'); goTo(0); play(true)")
                 speeds.append(f"{window.run(COUNT):.0f} frames/s {'side by side' if both else 'alone'}")
             what = window.run("`${N} agents, ${T} frames`")

@@ -20,8 +20,8 @@ from torchrl.data import ReplayBuffer
 from modgnn_rl import ModGNN, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import Flocks
-from modgnn_rl.trainers.imitation.learner import Learner
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer
+from modgnn_rl.trainers.imitation.learner import ImitationLearner
 from modgnn_rl.trainers.imitation.loss import imitation_loss, stacked_losses
 from modgnn_rl.utils.device import prepare_torch
 
@@ -50,8 +50,10 @@ def in_turns(runs: Mapping[str, Callable[[], object]]) -> dict[str, float]:
 
 def flown(policies: list[ModGNN], settings: DAggerConfig, num_agents: int = 32) -> ReplayBuffer:
     """Data for these policies."""
-    flocks = Flocks(FlockingConfig(), settings, 16, num_agents, policies, Reynolds(), steps=40, stretch=40, seed=0)
-    flocks.keep(flocks.fly(expert_share=1.0))
+    flocks = FlockBuffer(
+        FlockingConfig(), settings, 16, num_agents, policies, Reynolds(), steps=40, hold_steps=40, seed=0
+    )
+    flocks.keep(flocks.fly(beta=1.0))
     flocks.close()
     return flocks.buffer
 
@@ -60,9 +62,9 @@ def updates() -> None:
     """Print the time of an optimiser step for each model."""
     runs = {}
     for name, layers, batch, receivers in UPDATES:
-        settings = DAggerConfig(batch_size=batch, receivers=receivers, capacity=2000)
-        learner = Learner(make_model(name, layers=layers, seed=0), settings, (100, 100), seed=0)
-        data = flown([learner.flown], settings)
+        settings = DAggerConfig(batch_size=batch, agents_per_state=receivers, capacity=2000)
+        learner = ImitationLearner(make_model(name, layers=layers, seed=0), settings, (100, 100), seed=0)
+        data = flown([learner.ema_policy], settings)
         runs[f"{name}, {layers} layer(s), {batch} x {receivers}"] = functools.partial(learner.fit, data, 1)
     times = in_turns(runs)
     first = next(iter(times.values()))

@@ -17,7 +17,7 @@ from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.experiment.resume import TRAINER_SETTINGS
 
-WHOLE = ("forward", "logging", "logging: reference flights, once")
+WHOLE = ("forward", "logging", "logging: reference rollouts, once")
 
 
 class Clock:
@@ -65,32 +65,32 @@ def watched() -> Clock:
     from modgnn_rl.envs.flocking.expert import Reynolds
     from modgnn_rl.experiment import training
     from modgnn_rl.nn.modgnn import ModGNN
-    from modgnn_rl.trainers.collectors.flocks import Flocks
+    from modgnn_rl.trainers.collectors.flocks import FlockBuffer
     from modgnn_rl.trainers.collectors.local import FlockCollector
-    from modgnn_rl.trainers.common.optimization import Stepper
-    from modgnn_rl.trainers.imitation.loss import learner
-    from modgnn_rl.trainers.loop.dashboard_callback import Watch
-    from modgnn_rl.trainers.loop.training_loop import Journal
+    from modgnn_rl.trainers.common.optimization import GuardedOptimizer
+    from modgnn_rl.trainers.imitation import learner
+    from modgnn_rl.trainers.loop.dashboard_callback import DashboardCallback
+    from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 
     clock = Clock()
     clock.watch(FlockingEnv, "_step", "environment: physics and graph")
     clock.watch(FlockingEnv, "_reset", "environment: physics and graph")
     clock.watch(Reynolds, "forward", "expert")
     clock.watch(ModGNN, "forward", "policy, flying")
-    clock.watch(FlockCollector, "continue_flights", "collector")
-    clock.watch(Flocks, "keep", "data: windows into the buffer")
+    clock.watch(FlockCollector, "collect", "collector")
+    clock.watch(FlockBuffer, "keep", "data: windows into the buffer")
     clock.watch(ReplayBuffer, "sample", "batch assembly")
-    clock.watch(learner.Learner, "prepare", "batch assembly")
+    clock.watch(learner.ImitationLearner, "prepare", "batch assembly")
     clock.watch(learner, "imitation_loss", "forward")
     clock.watch(torch.Tensor, "backward", "backward")
-    clock.watch(Stepper, "step", "optimiser and moving average")
+    clock.watch(GuardedOptimizer, "step", "optimiser and moving average")
     clock.watch(AveragedModel, "update_parameters", "optimiser and moving average")
-    clock.watch(Journal, "_record", "logging")
-    clock.watch(Watch, "on_round", "logging")
-    clock.watch(Watch, "on_flights", "logging")
-    clock.watch(Watch, "on_start", "logging: reference flights, once")
-    clock.watch(Journal, "_save", "checkpoints")
-    clock.watch(Journal, "_save_best", "checkpoints")
+    clock.watch(TrainingLoop, "_record", "logging")
+    clock.watch(DashboardCallback, "on_round", "logging")
+    clock.watch(DashboardCallback, "on_flights", "logging")
+    clock.watch(DashboardCallback, "on_start", "logging: reference rollouts, once")
+    clock.watch(TrainingLoop, "_save", "checkpoints")
+    clock.watch(TrainingLoop, "_save_best", "checkpoints")
     training.evaluate_policies = lambda *_, **__: {}  # it comes after the training
     return clock
 

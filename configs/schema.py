@@ -21,6 +21,7 @@ __all__ = [
     "CollectConfig",
     "CollectorConfig",
     "DAggerConfig",
+    "EnvOverrides",
     "EvaluateConfig",
     "EvaluationConfig",
     "ExportConfig",
@@ -33,7 +34,6 @@ __all__ = [
     "TrainConfig",
     "TrainerConfig",
     "WandbConfig",
-    "WorldChanges",
     "as_list",
 ]
 
@@ -70,21 +70,21 @@ class FlockingConfig:
     """
 
     num_agents: Any = setting(
-        32, "agents in a flock, the leader included; a list trains on several sizes at once", low=1, whole=True
+        32, "agents in a flock, the leader included; a list trains on several sizes at once", ge=1, whole=True
     )
-    comm_range: float = setting(3.5, "distance within which agents hear each other, m", above=0)
-    max_steps: int = setting(1000, "control steps after which an episode is truncated", low=1)
-    max_speed: float = setting(0.92, "target velocities are projected onto the ball of this radius, m/s", above=0)
+    comm_range: float = setting(3.5, "distance within which agents hear each other, m", gt=0)
+    max_steps: int = setting(1000, "control steps after which an episode is truncated", ge=1)
+    max_speed: float = setting(0.92, "target velocities are projected onto the ball of this radius, m/s", gt=0)
 
-    cohesion_gain: float = setting(0.06, "expert: weight C_c of the Reynolds cohesion term", low=0)
-    separation_gain: float = setting(0.8, "expert: weight C_s of the Reynolds separation term", low=0)
-    alignment_gain: float = setting(0.02, "expert: weight C_a of the Reynolds alignment term", low=0)
+    cohesion_gain: float = setting(0.06, "expert: weight C_c of the Reynolds cohesion term", ge=0)
+    separation_gain: float = setting(0.8, "expert: weight C_s of the Reynolds separation term", ge=0)
+    alignment_gain: float = setting(0.02, "expert: weight C_a of the Reynolds alignment term", ge=0)
 
     graph: str = setting(
         "matrix", "form of the adjacency: matrix [N, N], or list of links [2, E]", choices=("matrix", "links")
     )
     max_links: int = setting(
-        64, "graph=links: room in the list for this many links an agent, on average over a flock", low=1
+        64, "graph=links: room in the list for this many links an agent, on average over a flock", ge=1
     )
 
     start: str = setting(
@@ -93,36 +93,36 @@ class FlockingConfig:
         choices=("ball", "grid", "clusters"),
     )
     start_radius: float = setting(
-        4.0, "radius of the starting ball of 32 agents, m; it scales with (N / 32)^(1/3)", above=0
+        4.0, "radius of the starting ball of 32 agents, m; it scales with (N / 32)^(1/3)", gt=0
     )
-    start_distance: float = setting(0.3, "smallest distance between two agents at the start, m", low=0)
-    start_clusters: int = setting(3, "start=clusters: number of clusters", low=1)
+    start_distance: float = setting(0.3, "smallest distance between two agents at the start, m", ge=0)
+    start_clusters: int = setting(3, "start=clusters: number of clusters", ge=1)
     leader: str = setting(
         "noise",
         "how the leader flies: integrated noise, from one random waypoint to the next, or in a circle",
         choices=("noise", "waypoints", "circle"),
     )
     leader_noise: float = setting(
-        0.10, "leader=noise: its target velocity gains N(0, leader_noise^2 dt) each step, m/s^1.5", low=0
+        0.10, "leader=noise: its target velocity gains N(0, leader_noise^2 dt) each step, m/s^1.5", ge=0
     )
     leader_max_speed: float = setting(
-        0.8, "leader=noise: its target velocity is kept in the ball of this radius, m/s", above=0
+        0.8, "leader=noise: its target velocity is kept in the ball of this radius, m/s", gt=0
     )
-    leader_speed: float = setting(0.5, "leader=waypoints or circle: its speed, m/s", low=0)
+    leader_speed: float = setting(0.5, "leader=waypoints or circle: its speed, m/s", ge=0)
     leader_radius: float = setting(
-        5.0, "leader=circle: radius, m; leader=waypoints: they lie within this distance of the origin, m", above=0
+        5.0, "leader=circle: radius, m; leader=waypoints: they lie within this distance of the origin, m", gt=0
     )
 
     physics: str = setting("torch", "physics engine", choices=("torch", "bullet"))
-    control_frequency: float = setting(48.0, "control steps a second, Hz", above=0)
-    physics_substeps: int = setting(5, "physics steps in a control step (5 x 48 Hz = 240 Hz)", low=1)
-    velocity_gain: float = setting(1.0, "velocity controller: proportional gain k_p, 1/s", above=0)
+    control_frequency: float = setting(48.0, "control steps a second, Hz", gt=0)
+    physics_substeps: int = setting(5, "physics steps in a control step (5 x 48 Hz = 240 Hz)", ge=1)
+    velocity_gain: float = setting(1.0, "velocity controller: proportional gain k_p, 1/s", gt=0)
     collisions: bool = setting(False, "whether agents bounce off each other; physics=bullet only")
     ground: float | None = setting(None, "height of a floor without friction, m; null: no floor")
-    linear_damping: float = setting(0.0, "Bullet's damping d of velocities, a = -d v (1 + |v|)", low=0)
-    angular_damping: float = setting(0.0, "Bullet's damping d of angular velocities, as that of velocities", low=0)
-    drag: float = setting(0.0, "drag of the rotors, as a multiple of the Crazyflie's as measured", low=0)
-    motor_lag: float = setting(0.0, "time constant with which rotor thrusts follow their commands, s", low=0)
+    linear_damping: float = setting(0.0, "Bullet's damping d of velocities, a = -d v (1 + |v|)", ge=0)
+    angular_damping: float = setting(0.0, "Bullet's damping d of angular velocities, as that of velocities", ge=0)
+    drag: float = setting(0.0, "drag of the rotors, as a multiple of the Crazyflie's as measured", ge=0)
+    motor_lag: float = setting(0.0, "time constant with which rotor thrusts follow their commands, s", ge=0)
     compile: bool = setting(False, "compile physics, graph and expert: seconds at the start, then faster")
     on_nonfinite: str = setting(
         "stop",
@@ -132,47 +132,47 @@ class FlockingConfig:
     )
 
     message_loss: float = setting(
-        0.0, "fault: probability that a message does not arrive, for each link and step", low=0, high=1
+        0.0, "fault: probability that a message does not arrive, for each link and step", ge=0, le=1
     )
     delay: int = setting(
-        0, "fault: control steps by which observations, and with them the messages made of them, are late", low=0
+        0, "fault: control steps by which observations, and with them the messages made of them, are late", ge=0
     )
     range_spread: float = setting(
         0.0,
-        "fault: each agent is heard within comm_range (1 + x), x uniform in +-range_spread, drawn for each flight",
-        low=0,
-        high=1,
+        "fault: each agent is heard within comm_range (1 + x), x uniform in +-range_spread, drawn for each rollout",
+        ge=0,
+        le=1,
     )
-    position_noise: float = setting(0.0, "fault: standard deviation of observed positions, m", low=0)
-    velocity_noise: float = setting(0.0, "fault: standard deviation of observed velocities, m/s", low=0)
+    position_noise: float = setting(0.0, "fault: standard deviation of observed positions, m", ge=0)
+    velocity_noise: float = setting(0.0, "fault: standard deviation of observed velocities, m/s", ge=0)
     dropout_rate: float = setting(
-        0.0, "fault: how often a follower drops out, 1/s; it hovers, and neither hears nor is heard", low=0
+        0.0, "fault: how often a follower drops out, 1/s; it hovers, and neither hears nor is heard", ge=0
     )
-    dropout_time: float = setting(2.0, "fault: mean time until one that dropped out comes back, s", above=0)
-    wind: float = setting(0.0, "fault: standard deviation of the gusts that push a flock, m/s^2 along each axis", low=0)
-    wind_time: float = setting(1.0, "fault: time over which gusts change, s", above=0)
+    dropout_time: float = setting(2.0, "fault: mean time until one that dropped out comes back, s", gt=0)
+    wind: float = setting(0.0, "fault: standard deviation of the gusts that push a flock, m/s^2 along each axis", ge=0)
+    wind_time: float = setting(1.0, "fault: time over which gusts change, s", gt=0)
 
     max_distance: float = setting(
-        30.0, "a flock has diverged when an agent is farther than this from its centre of mass, m", above=0
+        30.0, "a flock has diverged when an agent is farther than this from its centre of mass, m", gt=0
     )
     collision_distance: float = setting(
-        0.08, "two agents closer than this touch (twice the rotor arm), m; costs reward", low=0
+        0.08, "two agents closer than this touch (twice the rotor arm), m; costs reward", ge=0
     )
-    crowding_distance: float = setting(0.4, "agents closer than this are in each other's way, m; costs reward", above=0)
-    leader_cost: float = setting(0.1, "reward: weight of the distance from the leader, 1/m", low=0)
-    cohesion_cost: float = setting(0.05, "reward: weight of the distance from the flock's centre of mass, 1/m", low=0)
+    crowding_distance: float = setting(0.4, "agents closer than this are in each other's way, m; costs reward", gt=0)
+    leader_cost: float = setting(0.1, "reward: weight of the distance from the leader, 1/m", ge=0)
+    cohesion_cost: float = setting(0.05, "reward: weight of the distance from the flock's centre of mass, 1/m", ge=0)
     crowding_cost: float = setting(
-        1.0, "reward: weight of (1 - d / crowding_distance)^2, d being the distance of the nearest agent", low=0
+        1.0, "reward: weight of (1 - d / crowding_distance)^2, d being the distance of the nearest agent", ge=0
     )
-    collision_cost: float = setting(1.0, "reward: weight of touching another agent", low=0)
+    collision_cost: float = setting(1.0, "reward: weight of touching another agent", ge=0)
     alignment_cost: float = setting(
-        0.1, "reward: weight of the difference of the velocity from the flock's mean velocity, s/m", low=0
+        0.1, "reward: weight of the difference of the velocity from the flock's mean velocity, s/m", ge=0
     )
     effort_cost: float = setting(
-        0.02, "reward: weight of the difference of the target velocity from the velocity, s/m", low=0
+        0.02, "reward: weight of the difference of the target velocity from the velocity, s/m", ge=0
     )
     max_colliding: float = setting(
-        0.5, "a flock has collided beyond use when more than this share of its agents touch another", above=0, high=1
+        0.5, "a flock has collided beyond use when more than this share of its agents touch another", gt=0, le=1
     )
 
     @property
@@ -192,8 +192,8 @@ class FlockingConfig:
 
 
 _FLOWN_OTHERWISE = ("num_agents", "max_steps")  # settings of the evaluation
-WorldChanges = make_dataclass(
-    "WorldChanges",
+EnvOverrides = make_dataclass(
+    "EnvOverrides",
     [
         (entry.name, Any, field(default=None, metadata=entry.metadata))
         for entry in fields(FlockingConfig)
@@ -208,11 +208,11 @@ class ModelConfig:
     """The policy: one of the models of `modgnn_rl.models`."""
 
     name: str = setting("moment_force", "model", choices=MODEL_NAMES)
-    hops: int = setting(1, "communication hops K of each layer", low=0)
+    hops: int = setting(1, "communication hops K of each layer", ge=0)
     layers: int | None = setting(
-        None, "layers; with several, agents hear of others over layers x hops links; null: the model's own", low=1
+        None, "layers; with several, agents hear of others over layers x hops links; null: the model's own", ge=1
     )
-    hidden: int = setting(32, "width of the hidden layers", low=1)
+    hidden: int = setting(32, "width of the hidden layers", ge=1)
 
 
 @dataclass
@@ -221,21 +221,21 @@ class TrainerConfig:
 
     name: str = setting(MISSING, "trainer", choices=("bc", "dagger", "mappo"))
     num_envs: int = setting(
-        32, "flocks of 32 agents flown at once; other sizes get as many agents, shared between the sizes", low=1
+        32, "flocks of 32 agents flown at once; other sizes get as many agents, shared between the sizes", ge=1
     )
-    receivers: int = setting(
+    agents_per_state: int = setting(
         4,
         "agents of a state of 32 that count in an update; at other sizes N, as many links: 32 / N times as many agents",
-        low=1,
+        ge=1,
     )
-    averaging: float = setting(0.995, "decay of the moving average of the weights, which is evaluated", low=0, high=1)
-    max_gradient: float = setting(1.0, "gradients are clipped to this norm", above=0)
+    ema_decay: float = setting(0.995, "decay of the moving average of the weights, which is evaluated", ge=0, le=1)
+    max_grad_norm: float = setting(1.0, "gradients are clipped to this norm", gt=0)
     checkpoint_minutes: float = setting(
         1.0,
         "time between two checkpoints, min; longer where writing would take more than 1.5 % of it; 0: after each round",
-        low=0,
+        ge=0,
     )
-    keep_checkpoints: int = setting(2, "checkpoints kept, beside the best policy", low=1)
+    keep_checkpoints: int = setting(2, "checkpoints kept, beside the best policy", ge=1)
     checkpoint_data: bool = setting(
         True, "keep the data learned from in checkpoints: large, but a run that is resumed ends as if it never stopped"
     )
@@ -246,49 +246,47 @@ class TrainerConfig:
 
 @dataclass
 class ImitationConfig(TrainerConfig):
-    """What behaviour cloning and DAgger share: how flights become data, and data become a policy."""
+    """What behaviour cloning and DAgger share: how rollouts become data, and data become a policy."""
 
-    every: int = setting(2, "of the steps flown, each how-manyth becomes data", low=1)
-    capacity: int = setting(80_000, "flock states kept for each size", low=1)
+    stride: int = setting(2, "of the steps flown, each how-manyth becomes data", ge=1)
+    capacity: int = setting(80_000, "flock states kept for each size", ge=1)
     replacement: str = setting(
         "fifo",
         "which states go when there is no more room: the oldest, or any, so that all ever seen are kept alike",
         choices=("fifo", "reservoir"),
     )
-    batch_size: int = setting(256, "flock states in a batch", low=1)
+    batch_size: int = setting(256, "flock states in a batch", ge=1)
     learning_rates: list[float] = setting(
         [3e-3, 1e-3, 1e-4],
         "Adam: at the start, after the cloning updates, at the end; cosines between",
-        above=0,
+        gt=0,
         length=3,
     )
     rotate: bool = setting(
         True, "turn each state of a batch by a random rotation, unless the model is equivariant and turns with it"
     )
-    hide_velocity: float = setting(
-        0.0, "share of the states of a batch in which all velocities are hidden", low=0, high=1
-    )
-    held_out: int = setting(8, "flocks whose flights are kept for the validation error", low=1)
+    hide_velocity: float = setting(0.0, "share of the states of a batch in which all velocities are hidden", ge=0, le=1)
+    num_val_envs: int = setting(8, "flocks whose rollouts are kept for the validation error", ge=1)
 
 
 @dataclass
 class BCConfig(ImitationConfig):
-    """Behaviour cloning: fit the expert on the expert's own flights."""
+    """Behaviour cloning: fit the expert on the expert's own rollouts."""
 
     name: str = setting("bc", "trainer", choices=("bc",))
-    cloning_steps: int = setting(1000, "steps that the expert flies", low=1)
-    cloning_updates: int = setting(6000, "updates on its flights, shared by the sizes", low=1)
+    cloning_steps: int = setting(1000, "steps that the expert flies", ge=1)
+    cloning_updates: int = setting(6000, "updates on its rollouts, shared by the sizes", ge=1)
     models: Any = setting(
         None, "models trained side by side on the same batches, a list; null: model.name", choices=MODEL_NAMES
     )
-    hops: Any = setting(None, "numbers of hops of each of them, a list; null: model.hops", low=0, whole=True)
-    seeds: int = setting(1, "initial weights of each of them, trained side by side", low=1)
-    noise: float = setting(0.0, "standard deviation of the noise in the actions that the expert flies, m/s", low=0)
+    hops: Any = setting(None, "numbers of hops of each of them, a list; null: model.hops", ge=0, whole=True)
+    seeds: int = setting(1, "initial weights of each of them, trained side by side", ge=1)
+    noise: float = setting(0.0, "standard deviation of the noise in the actions that the expert flies, m/s", ge=0)
     dart: bool = setting(
         False, "fly in four parts, after each of which the noise becomes the policy's own error (DART)"
     )
     dataset: str | None = setting(
-        None, "folder made by modgnn_rl.collect, whose flights are cloned; null: the expert flies num_envs flocks"
+        None, "folder made by modgnn_rl.collect, whose rollouts are cloned; null: the expert flies num_envs flocks"
     )
 
 
@@ -297,31 +295,31 @@ class DAggerConfig(ImitationConfig):
     """DAgger: clone the expert a little, then fly, ask the expert, aggregate and fit, round by round."""
 
     name: str = setting("dagger", "trainer", choices=("dagger",))
-    cloning_steps: int = setting(200, "steps that the expert flies at first", low=1)
-    cloning_updates: int = setting(400, "updates on its flights, shared by the sizes", low=0)
-    rounds: int = setting(80, "rounds of flying and fitting", low=0)
-    round_steps: int = setting(40, "steps flown in a round", low=1)
-    round_updates: int = setting(60, "updates in a round, shared by the sizes", low=1)
+    cloning_steps: int = setting(200, "steps that the expert flies at first", ge=1)
+    cloning_updates: int = setting(400, "updates on its rollouts, shared by the sizes", ge=0)
+    rounds: int = setting(80, "rounds of flying and fitting", ge=0)
+    steps_per_round: int = setting(40, "steps flown in a round", ge=1)
+    updates_per_round: int = setting(60, "updates in a round, shared by the sizes", ge=1)
     schedule: str = setting(
         "exponential",
         "how the expert's share falls until it flies no more",
         choices=("constant", "linear", "exponential"),
     )
-    expert_share: float = setting(0.6, "the expert's share in the first round", low=0, high=1)
-    share_decay: float = setting(0.6, "exponential schedule: factor between two rounds", low=0, high=1)
-    expert_rounds: int = setting(13, "round from which on the policy flies alone", low=0)
-    stretch: int = setting(40, "steps that the one who flies a flock keeps it", low=1)
+    beta: float = setting(0.6, "the expert's share in the first round", ge=0, le=1)
+    beta_decay: float = setting(0.6, "exponential schedule: factor between two rounds", ge=0, le=1)
+    beta_rounds: int = setting(13, "round from which on the policy flies alone", ge=0)
+    hold_steps: int = setting(40, "steps that the one who flies a flock keeps it", ge=1)
     gate: str = setting(
         "none",
         "let the expert fly a flock where the policy strays: by its disagreement with it, or an ensemble's spread",
         choices=("none", "disagreement", "ensemble"),
     )
-    gate_threshold: float = setting(0.6, "disagreement or spread above which the expert flies, m/s", above=0)
-    ensemble: int = setting(3, "gate=ensemble: policies trained side by side, of which the first flies", low=2)
+    gate_threshold: float = setting(0.6, "disagreement or spread above which the expert flies, m/s", gt=0)
+    ensemble: int = setting(3, "gate=ensemble: policies trained side by side, of which the first flies", ge=2)
     plateau_rounds: int = setting(
-        0, "stop when the error of these many rounds is hardly below that of as many before; 0: never", low=0
+        0, "stop when the error of these many rounds is hardly below that of as many before; 0: never", ge=0
     )
-    plateau_gain: float = setting(0.03, "smallest relative improvement that counts", low=0, high=1)
+    plateau_gain: float = setting(0.03, "smallest relative improvement that counts", ge=0, le=1)
 
 
 @dataclass
@@ -329,30 +327,30 @@ class MAPPOConfig(TrainerConfig):
     """MAPPO: reinforcement learning from the world's reward, best of a policy that can fly already (``init_from``)."""
 
     name: str = setting("mappo", "trainer", choices=("mappo",))
-    averaging: float = setting(0.99, "decay of the moving average of the weights, which is evaluated", low=0, high=1)
-    receivers: int = setting(
+    ema_decay: float = setting(0.99, "decay of the moving average of the weights, which is evaluated", ge=0, le=1)
+    agents_per_state: int = setting(
         8,
         "agents of a state of 32 that count in an update; at other sizes N, as many links: 32 / N times as many agents",
-        low=1,
+        ge=1,
     )
-    iterations: int = setting(100, "rounds of flying and improving", low=1)
-    round_steps: int = setting(50, "steps flown in a round", low=2)
-    critic_warmup: int = setting(10, "rounds at first in which only the critic learns", low=0)
-    epochs: int = setting(4, "passes over the flights of a round", low=1)
-    batches: int = setting(4, "batches that the flights of a round are split into, for each size", low=1)
-    window: int = setting(10, "steps of the windows from which learned messages are made anew", low=1)
-    noise: float = setting(0.3, "standard deviation of the explored actions at the start, m/s", above=0)
-    discount: float = setting(0.99, "discount of a step", low=0, high=0.9999)
-    trace: float = setting(0.95, "lambda of the advantage estimator (GAE)", low=0, high=1)
-    clip: float = setting(0.2, "probability ratios are clipped to 1 +- this", above=0, high=1)
-    entropy: float = setting(0.0, "weight of the entropy of the actions in the objective", low=0)
-    learning_rate: float = setting(3e-4, "Adam: of the policy", above=0)
-    critic_learning_rate: float = setting(1e-3, "Adam: of the critic", above=0)
-    critic_hidden: int = setting(64, "width of the critic's networks", low=1)
-    anchor: float = setting(
-        0.1, "weight of the divergence (KL) from the policy that training began with, in the first round", low=0
+    rounds: int = setting(100, "rounds of flying and improving", ge=1)
+    steps_per_round: int = setting(50, "steps flown in a round", ge=2)
+    critic_warmup: int = setting(10, "rounds at first in which only the critic learns", ge=0)
+    epochs: int = setting(4, "passes over the rollouts of a round", ge=1)
+    num_minibatches: int = setting(4, "batches that the rollouts of a round are split into, for each size", ge=1)
+    window: int = setting(10, "steps of the windows from which learned messages are made anew", ge=1)
+    noise: float = setting(0.3, "standard deviation of the explored actions at the start, m/s", gt=0)
+    gamma: float = setting(0.99, "discount of a step", ge=0, le=0.9999)
+    gae_lambda: float = setting(0.95, "lambda of the advantage estimator (GAE)", ge=0, le=1)
+    clip_epsilon: float = setting(0.2, "probability ratios are clipped to 1 +- this", gt=0, le=1)
+    entropy_coef: float = setting(0.0, "weight of the entropy of the actions in the objective", ge=0)
+    learning_rate: float = setting(3e-4, "Adam: of the policy", gt=0)
+    critic_learning_rate: float = setting(1e-3, "Adam: of the critic", gt=0)
+    critic_hidden: int = setting(64, "width of the critic's networks", ge=1)
+    kl_coef: float = setting(
+        0.1, "weight of the divergence (KL) from the policy that training began with, in the first round", ge=0
     )
-    anchor_rounds: int = setting(50, "rounds over which that weight fades to zero; 0: it stays", low=0)
+    kl_rounds: int = setting(50, "rounds over which that weight fades to zero; 0: it stays", ge=0)
 
 
 @dataclass
@@ -363,17 +361,17 @@ class WandbConfig:
     entity: str | None = setting(None, "whose project: a user or a team; null: your own")
     group: str | None = setting(None, "group of runs that the run is one of; null: none")
     mode: str = setting("offline", "whether the run is sent while it trains", choices=("offline", "online", "disabled"))
-    init_timeout: float = setting(8.0, "longest wait for the server at the start and at the end, s", above=0, high=12)
+    init_timeout: float = setting(8.0, "longest wait for the server at the start and at the end, s", gt=0, le=12)
 
 
 @dataclass
 class EvaluationConfig:
-    """Flights that tell how good a policy is."""
+    """Rollouts that tell how good a policy is."""
 
-    num_flocks: int = setting(100, "fresh flocks that each policy flies", low=2)
-    num_agents: Any = setting(None, "agents in a flock, or a list of sizes; null: as in training", low=1, whole=True)
-    steps: int = setting(1000, "steps of a flight", low=4)
-    seed: int = setting(1_000_000, "seed of starts and leaders, apart from those of training", low=0, high=2**32)
+    num_flocks: int = setting(100, "fresh flocks that each policy flies", ge=2)
+    num_agents: Any = setting(None, "agents in a flock, or a list of sizes; null: as in training", ge=1, whole=True)
+    steps: int = setting(1000, "steps of a rollout", ge=4)
+    seed: int = setting(1_000_000, "seed of starts and leaders, apart from those of training", ge=0, le=2**32)
 
 
 @dataclass
@@ -386,10 +384,10 @@ class CollectorConfig:
         choices=("single", "process", "ray"),
     )
     workers: int | None = setting(
-        None, "collector=process or ray: workers, among which the flocks are shared out; null: one a core", low=1
+        None, "collector=process or ray: workers, among which the flocks are shared out; null: one a core", ge=1
     )
     timeout: float = setting(
-        60.0, "longest wait for a worker's flights; one that takes longer is ended and replaced, s", above=0
+        60.0, "longest wait for a worker's rollouts; one that takes longer is ended and replaced, s", gt=0
     )
     ray_address: str | None = setting(
         None, "collector=ray: address of a Ray cluster, as in 10.0.0.1:6379; null: Ray is started on this machine"
@@ -404,10 +402,10 @@ class TrainConfig:
     model: ModelConfig = field(default_factory=ModelConfig)
     trainer: Any = MISSING
     collector: CollectorConfig = field(default_factory=CollectorConfig)
-    seed: int = setting(0, "fixes everything that is drawn", low=0, high=2**32)
+    seed: int = setting(0, "fixes everything that is drawn", ge=0, le=2**32)
     name: str | None = setting(None, "name of the run; null: trainer and model")
     device: str = setting("cpu", "where to train: cpu, cuda, cuda:1")
-    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
+    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", ge=0)
     runs: str = setting("runs", "folder for the run folders")
     resume: str | None = setting(
         None, "run folder of a run to go on with; its settings are taken from there, but for those given beside it"
@@ -418,25 +416,25 @@ class TrainConfig:
     logger: Any = setting("none", "dashboards to write for beside the plain files, one or a list", choices=LOGGER_NAMES)
     wandb: WandbConfig = field(default_factory=WandbConfig)
     video_rounds: int = setting(
-        40, "logger=tensorboard or wandb: a film of a flight each so many rounds; 0: none", low=0
+        40, "logger=tensorboard or wandb: a film of a rollout each so many rounds; 0: none", ge=0
     )
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
 @dataclass
 class CollectConfig:
-    """A dataset of the expert's flights."""
+    """A dataset of the expert's rollouts."""
 
     env: FlockingConfig = field(default_factory=FlockingConfig)
-    episodes: int = setting(1000, "flights; more than a dataset has are added to it", low=1)
-    steps: int | None = setting(None, "steps of a flight, none of which ends early; null: env.max_steps", low=1)
+    episodes: int = setting(1000, "rollouts; more than a dataset has are added to it", ge=1)
+    steps: int | None = setting(None, "steps of a rollout, none of which ends early; null: env.max_steps", ge=1)
     num_envs: int = setting(
-        50, "flocks flown at once; their flights are held in memory, and one part of the dataset", low=1
+        50, "flocks flown at once; their rollouts are held in memory, and one part of the dataset", ge=1
     )
-    seed: int = setting(0, "fixes everything that is drawn", low=0, high=2**32)
+    seed: int = setting(0, "fixes everything that is drawn", ge=0, le=2**32)
     output: str | None = setting(None, "folder of the dataset; null: datasets/<number of agents>-agents")
     device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
-    threads: int = setting(1, "threads of torch on the CPU; 0: one a core", low=0)
+    threads: int = setting(1, "threads of torch on the CPU; 0: one a core", ge=0)
 
 
 @dataclass
@@ -445,10 +443,10 @@ class EvaluateConfig:
 
     run: str = setting(MISSING, "run folder")
     checkpoint: str = setting("last", "which policy: the last, or the best while it trained", choices=("last", "best"))
-    env: Any = field(default_factory=WorldChanges)
+    env: Any = field(default_factory=EnvOverrides)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
-    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
+    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", ge=0)
 
 
 @dataclass
@@ -457,33 +455,33 @@ class ExportConfig:
 
     run: str = setting(MISSING, "run folder")
     output: str | None = setting(None, "folder for the exported agent, made anew; null: agent/ in the run folder")
-    threads: int = setting(1, "threads of torch where its latency is measured; 0: one a core", low=0)
+    threads: int = setting(1, "threads of torch where its latency is measured; 0: one a core", ge=0)
 
 
 @dataclass
 class ReplayConfig:
-    """A flight to look at."""
+    """A rollout to look at."""
 
     run: str = setting(MISSING, "run folder")
     checkpoint: str = setting("last", "which policy: the last, or the best while it trained", choices=("last", "best"))
-    env: Any = field(default_factory=WorldChanges)
-    others: Any = setting(None, "run folders whose policies fly the same flight, one or a list; null: none")
-    with_expert: bool = setting(True, "show the expert's flight from the same start too; not in a film")
-    num_agents: int | None = setting(None, "agents in the flock; null: as in training", low=1)
-    steps: int = setting(1000, "steps of the flight", low=1)
-    every: int | None = setting(
-        None, "of the steps flown, each how-manyth is kept; null: each, unless agents x steps are very many", low=1
+    env: Any = field(default_factory=EnvOverrides)
+    others: Any = setting(None, "run folders whose policies fly the same rollout, one or a list; null: none")
+    with_expert: bool = setting(True, "show the expert's rollout from the same start too; not in a film")
+    num_agents: int | None = setting(None, "agents in the flock; null: as in training", ge=1)
+    steps: int = setting(1000, "steps of the rollout", ge=1)
+    stride: int | None = setting(
+        None, "of the steps flown, each how-manyth is kept; null: each, unless agents x steps are very many", ge=1
     )
-    seed: int = setting(1_000_000, "seed of start and leader", low=0, high=2**32)
+    seed: int = setting(1_000_000, "seed of start and leader", ge=0, le=2**32)
     format: str = setting(
-        "html", "a page that plays the flight, a film, or a picture of one step", choices=("html", "mp4", "svg", "png")
+        "html", "a page that plays the rollout, a film, or a picture of one step", choices=("html", "mp4", "svg", "png")
     )
-    step: int | None = setting(None, "format=svg or png: the step that the picture shows; null: the last", low=0)
+    step: int | None = setting(None, "format=svg or png: the step that the picture shows; null: the last", ge=0)
     output: str | None = setting(None, "file to write; null: replay.<format> in the run folder")
-    viewer: bool = setting(False, "watch the flight in a browser while it is flown; needs modgnn-rl[viewer]")
-    port: int = setting(8080, "viewer=true: port on this machine", low=1, high=65535)
+    viewer: bool = setting(False, "watch the rollout in a browser while it is flown; needs modgnn-rl[viewer]")
+    port: int = setting(8080, "viewer=true: port on this machine", ge=1, le=65535)
     device: str = setting("cpu", "where to fly: cpu, cuda, cuda:1")
-    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", low=0)
+    threads: int = setting(1, "threads of torch on the CPU; more rarely help at this size; 0: one a core", ge=0)
 
 
 @dataclass
@@ -512,22 +510,22 @@ class ScaleConfig:
     """How large a reproduction of the paper is; the defaults are ``scale=small``."""
 
     name: str = setting("small", "what it is called in tables")
-    episodes: int = setting(200, "flights of the expert to train on", low=1)
-    steps: int = setting(500, "steps of each", low=2)
-    held_out: int = setting(32, "further flights of the expert, for the validation error", low=1)
-    updates: int = setting(6000, "updates of each cloned model", low=1)
-    batch_size: int = setting(64, "flock states in a batch", low=1)
-    flocks: int = setting(32, "fresh flocks that each policy flies", low=2)
-    flight_steps: int = setting(1000, "steps of a flight", low=4)
-    sizes: list[int] = setting([16, 32, 64], "numbers of agents that each policy is flown with (Table 3)", low=2)
-    rounds: int = setting(40, "after=dagger or mappo: rounds of DAgger", low=1)
-    iterations: int = setting(60, "after=mappo: rounds of MAPPO", low=1)
-    num_envs: int = setting(16, "after=dagger or mappo: flocks flown at once", low=1)
-    study_updates: int = setting(4000, "study=communication or layers: updates of each model", low=1)
-    study_flocks: int = setting(16, "study=...: fresh flocks that each policy flies, of 32 agents or fewer", low=2)
-    study_steps: int = setting(400, "study=...: steps of a flight", low=4)
+    episodes: int = setting(200, "rollouts of the expert to train on", ge=1)
+    steps: int = setting(500, "steps of each", ge=2)
+    val_episodes: int = setting(32, "further rollouts of the expert, for the validation error", ge=1)
+    updates: int = setting(6000, "updates of each cloned model", ge=1)
+    batch_size: int = setting(64, "flock states in a batch", ge=1)
+    eval_episodes: int = setting(32, "fresh flocks that each policy flies", ge=2)
+    eval_steps: int = setting(1000, "steps of a rollout", ge=4)
+    sizes: list[int] = setting([16, 32, 64], "numbers of agents that each policy is flown with (Table 3)", ge=2)
+    dagger_rounds: int = setting(40, "after=dagger or mappo: rounds of DAgger", ge=1)
+    mappo_rounds: int = setting(60, "after=mappo: rounds of MAPPO", ge=1)
+    num_envs: int = setting(16, "after=dagger or mappo: flocks flown at once", ge=1)
+    study_updates: int = setting(4000, "study=communication or layers: updates of each model", ge=1)
+    study_episodes: int = setting(16, "study=...: fresh flocks that each policy flies, of 32 agents or fewer", ge=2)
+    study_steps: int = setting(400, "study=...: steps of a rollout", ge=4)
     study_sizes: list[int] = setting(
-        [4, 8, 16, 32, 64, 128, 256, 512, 1024], "study=size: numbers of agents that each policy is flown with", low=2
+        [4, 8, 16, 32, 64, 128, 256, 512, 1024], "study=size: numbers of agents that each policy is flown with", ge=2
     )
 
 
@@ -537,10 +535,10 @@ class ReproduceConfig:
 
     env: FlockingConfig = field(default_factory=FlockingConfig)
     scale: ScaleConfig = field(default_factory=ScaleConfig)
-    seeds: int = setting(1, "trainings of each model, with other initial weights and batches each", low=1)
+    seeds: int = setting(1, "trainings of each model, with other initial weights and batches each", ge=1)
     after: str = setting(
         "cloning",
-        "what the policies have learned from: the expert's flights as in the paper, then DAgger, then MAPPO",
+        "what the policies have learned from: the expert's rollouts as in the paper, then DAgger, then MAPPO",
         choices=("cloning", "dagger", "mappo"),
     )
     study: str = setting(
@@ -555,10 +553,10 @@ class ReproduceConfig:
         "null: none",
         choices=MODEL_NAMES,
     )
-    hops: Any = setting([1, 2, 3], "numbers of hops of these", low=0, whole=True)
+    hops: Any = setting([1, 2, 3], "numbers of hops of these", ge=0, whole=True)
     folder: str | None = setting(
         None, "where all goes; what is finished there is not made again; null: reproduction/<scale>"
     )
-    seed: int = setting(0, "fixes everything that is drawn", low=0, high=2**32)
+    seed: int = setting(0, "fixes everything that is drawn", ge=0, le=2**32)
     device: str = setting("cpu", "where to train and fly: cpu, cuda, cuda:1")
-    threads: int = setting(1, "threads of torch on the CPU; the same command in a second terminal helps more", low=0)
+    threads: int = setting(1, "threads of torch on the CPU; the same command in a second terminal helps more", ge=0)

@@ -4,7 +4,7 @@ A setting is declared once, in a dataclass beside the code it configures::
 
     @dataclass
     class FlockingConfig:
-        comm_range: float = setting(3.5, "distance within which agents hear each other, m", above=0)
+        comm_range: float = setting(3.5, "distance within which agents hear each other, m", gt=0)
 
 :func:`check` then holds any such dataclass (nested ones too) against the declared ranges, both for the command
 line and for people who build the objects in Python.
@@ -26,11 +26,11 @@ __all__ = ["check", "flat", "setting", "suggestion"]
 
 def setting(
     default: Any,
-    doc: str,
+    help: str,
     *,
-    low: float | None = None,
-    above: float | None = None,
-    high: float | None = None,
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
     choices: Sequence[Any] | None = None,
     whole: bool = False,
     length: int | None = None,
@@ -39,15 +39,15 @@ def setting(
 
     Args:
         default: default value; lists are copied for each instance.
-        doc: one line that says what the setting does, with its unit.
-        low: smallest legal value.
-        above: exclusive lower bound.
-        high: largest legal value.
+        help: one line that says what the setting does, with its unit.
+        ge: smallest legal value.
+        gt: exclusive lower bound.
+        le: largest legal value.
         choices: the legal values, where they can be listed; a list may grow later.
         whole: accept whole numbers and lists of them only; for settings that may be either.
         length: length of a list.
     """
-    metadata: dict[str, Any] = {"doc": doc, "low": low, "above": above, "high": high, "whole": whole, "length": length}
+    metadata: dict[str, Any] = {"help": help, "ge": ge, "gt": gt, "le": le, "whole": whole, "length": length}
     metadata["choices"] = choices
     if isinstance(default, list):
         return dataclasses.field(default_factory=lambda: copy.copy(default), metadata=metadata)
@@ -69,7 +69,7 @@ def check(config: Any, path: str = "") -> None:
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
             check(value, name)
-        elif "doc" in field.metadata:
+        elif "help" in field.metadata:
             if value is None and field.default is None:
                 continue
             _check_list(name, value, field.metadata)
@@ -80,7 +80,7 @@ def _check_list(name: str, value: Any, rule: Any) -> None:
     items = list(value) if isinstance(value, (list, tuple)) else [value]
     length = rule["length"] or max(1, len(items))
     if len(items) != length:
-        raise InputError(f"{name}={items} has {len(items)} values; it needs {length} ({rule['doc']})")
+        raise InputError(f"{name}={items} has {len(items)} values; it needs {length} ({rule['help']})")
     for item in items:
         _check_value(name, item, rule)
 
@@ -92,21 +92,21 @@ def _check_value(name: str, value: Any, rule: Any) -> None:
         hint = suggestion(str(value), [str(choice) for choice in choices])
         raise InputError(f"{name}={value} is not one of {', '.join(map(str, choices))}{hint}")
     if rule["whole"] and (isinstance(value, bool) or not isinstance(value, int)):
-        raise InputError(f"{name}={value} is not a whole number or a list of them ({rule['doc']})")
-    if all(rule[bound] is None for bound in ("low", "above", "high")):
+        raise InputError(f"{name}={value} is not a whole number or a list of them ({rule['help']})")
+    if all(rule[bound] is None for bound in ("ge", "gt", "le")):
         return
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"{name}={value} is not a number ({rule['doc']})")
+        raise InputError(f"{name}={value} is not a number ({rule['help']})")
     if math.isnan(value):
-        raise InputError(f"{name} is not a number; expected {rule['doc']}")
+        raise InputError(f"{name} is not a number; expected {rule['help']}")
     bounds = (
-        (rule["low"] is not None and value < rule["low"], f"at least {rule['low']}"),
-        (rule["above"] is not None and value <= rule["above"], f"greater than {rule['above']}"),
-        (rule["high"] is not None and value > rule["high"], f"at most {rule['high']}"),
+        (rule["ge"] is not None and value < rule["ge"], f"at least {rule['ge']}"),
+        (rule["gt"] is not None and value <= rule["gt"], f"greater than {rule['gt']}"),
+        (rule["le"] is not None and value > rule["le"], f"at most {rule['le']}"),
     )
     for broken, expected in bounds:
         if broken:
-            raise InputError(f"{name}={value} is out of range: it must be {expected} ({rule['doc']})")
+            raise InputError(f"{name}={value} is out of range: it must be {expected} ({rule['help']})")
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

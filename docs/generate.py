@@ -231,14 +231,14 @@ def _table(section: Section, place: str) -> list[str]:
     hints = typing.get_type_hints(section.kind)
     lines = ["{.settings}", "| setting | default | legal | what it does |", "|---|---|---|---|"]
     for field in dataclasses.fields(section.kind):
-        if "doc" not in field.metadata:
+        if "help" not in field.metadata:
             continue
         default = _default(field)
         name = f"{section.prefix}.{field.name}".lstrip(".")
         others = [
             f"{_shown(p[field.name])} with `{choice}`" for choice, p in section.presets.items() if field.name in p
         ]
-        doc = _cell(field.metadata["doc"]) + (f"<br>*{'; '.join(others)}*" if others else "")
+        doc = _cell(field.metadata["help"]) + (f"<br>*{'; '.join(others)}*" if others else "")
         shown = "required" if default == MISSING else _shown(default)
         anchor = _slug(f"{place}{field.name}", "-")
         lines.append(f"| [`{name}`]{{#{anchor}}} | {shown} | {_legal(field, hints[field.name])} | {doc} |")

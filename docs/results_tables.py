@@ -84,7 +84,7 @@ def verdict(row: Mapping[str, str]) -> str:
 
 
 VALIDATION = Column("validation", "table1", "mean", "paper")
-OWN_FLIGHTS = Column("own flights", "table2", "error", "error, paper")
+OWN_FLIGHTS = Column("own rollouts", "table2", "error", "error, paper")
 TABLES: dict[str, Callable[[], str]] = {
     "errors": lambda: figures([VALIDATION, OWN_FLIGHTS]),
     "sizes": lambda: figures([Column(f"{n} agents", "table3", f"N = {n}", f"N = {n}, paper") for n in (16, 64)]),

@@ -84,7 +84,7 @@ def parallel_flocks(
         num_envs: flocks in each of them.
         num_agents: agents in each flock, see `modgnn_rl.envs.flocking.env.FlockingEnv`; default: the configuration's.
         config: settings of the world; default: ``FlockingConfig(**settings)``.
-        seed: seed from which each process derives its own; equal seeds give equal flights, bit for bit.
+        seed: seed from which each process derives its own; equal seeds give equal rollouts, bit for bit.
         dtype: floating-point type of the physics and of everything emitted.
         stagger: see `modgnn_rl.envs.flocking.env.FlockingEnv`.
         settings: fields of `FlockingConfig`, when no ``config`` is given.

@@ -22,14 +22,14 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.deploy.export import export_agent
 from modgnn_rl.deploy.onnx_agent import OnnxAgent
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.tracking.loading import stored_world
+from modgnn_rl.tracking.loading import load_env_config
 from modgnn_rl.tracking.run_folder import RunFolder
 
 
 @torch.no_grad()
-def fly(policy: ModGNN, world: FlockingConfig, folder: Path, num_agents: int, steps: int) -> float:
+def rollout(policy: ModGNN, env_config: FlockingConfig, folder: Path, num_agents: int, steps: int) -> float:
     """Fly one flock with the agents in ``folder``; returns the largest difference from the policy's actions, m/s."""
-    env = TransformedEnv(FlockingEnv(1, num_agents, config=world, seed=0), InitTracker())
+    env = TransformedEnv(FlockingEnv(1, num_agents, config=env_config, seed=0), InitTracker())
     env.append_transform(policy.make_tensordict_primer())
     robots = [OnnxAgent(folder) for _ in range(num_agents)]
     difference = 0.0
@@ -55,11 +55,15 @@ def main(run: Path | None = None, num_agents: int = 16, steps: int = 240) -> flo
     """Fly the agents of a run, which ``python -m modgnn_rl.export run=<folder>`` made; or export some and fly them."""
     with tempfile.TemporaryDirectory() as scratch:
         if run is None:
-            world, policy, folder = FlockingConfig(), make_model("pair_force", hops=2, seed=0), Path(scratch) / "agent"
+            env_config, policy, folder = (
+                FlockingConfig(),
+                make_model("pair_force", hops=2, seed=0),
+                Path(scratch) / "agent",
+            )
             export_agent(policy, folder, torch.zeros(6))
         else:
-            world, policy, folder = stored_world(RunFolder.open(run)), load_policy(run), run / "agent"
-        difference = fly(policy, world, folder, num_agents, steps)
+            env_config, policy, folder = load_env_config(RunFolder.open(run)), load_policy(run), run / "agent"
+        difference = rollout(policy, env_config, folder, num_agents, steps)
     print(f"{num_agents} robots flew {steps} steps; largest difference of an action: {difference:.1e} m/s")
     return difference
 

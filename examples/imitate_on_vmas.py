@@ -26,7 +26,7 @@ from torchrl.modules import get_primers_from_module
 
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.models.blocks import mlp
-from modgnn_rl.trainers.collectors.behaviour import Mixture
+from modgnn_rl.trainers.collectors.behaviour import BetaMixture
 from modgnn_rl.trainers.collectors.windows import as_windows
 from modgnn_rl.trainers.imitation.loss import imitation_loss
 
@@ -85,16 +85,16 @@ class HidePosition(nn.Module):
 
 
 @torch.no_grad()
-def fly(pilot: TensorDictModuleBase, num_envs: int, num_agents: int, steps: int) -> tuple[float, float]:
+def rollout(pilot: TensorDictModuleBase, num_envs: int, num_agents: int, steps: int) -> tuple[float, float]:
     """Error of the pilot's actions against the expert's, and return of a robot, on episodes of the pilot's own."""
     env = make_env(num_envs, num_agents, steps, seed=1)
     primer = get_primers_from_module(pilot, warn=False)
     if primer is not None:
         env.append_transform(primer)
-    flights = env.rollout(steps, pilot, break_when_any_done=False)
-    difference = flights[ACTION] - keep_right(flights[OBSERVATION])
-    ended = flights["next", "done"].cumsum(1) - flights["next", "done"].long() > 0
-    reward = torch.where(ended.unsqueeze(-1), 0.0, flights["next", "robots", "reward"])
+    rollouts = env.rollout(steps, pilot, break_when_any_done=False)
+    difference = rollouts[ACTION] - keep_right(rollouts[OBSERVATION])
+    ended = rollouts["next", "done"].cumsum(1) - rollouts["next", "done"].long() > 0
+    reward = torch.where(ended.unsqueeze(-1), 0.0, rollouts["next", "robots", "reward"])
     return difference.square().mean().item(), reward.sum(1).mean().item()
 
 
@@ -115,9 +115,9 @@ def main(
     torch.manual_seed(seed)
     policy, expert = make_policy(hops), TensorDictModule(keep_right, [OBSERVATION], [EXPERT])
     size = (num_envs, num_agents, steps)
-    results = {"policy before": fly(policy, *size)}
+    results = {"policy before": rollout(policy, *size)}
     generator = torch.Generator().manual_seed(seed)
-    mixture = Mixture(1.0, steps, generator, action=ACTION, expert_action=EXPERT)
+    mixture = BetaMixture(1.0, steps, generator, action=ACTION, expert_action=EXPERT)
     collector = Collector(
         make_env(*size, seed),
         TensorDictSequential(policy, expert, mixture),
@@ -129,10 +129,10 @@ def main(
     optimiser = torch.optim.Adam(policy.parameters(), lr=1e-3)
     everybody = torch.ones(256, num_agents, dtype=torch.bool)
 
-    for number, flights in enumerate(collector):
+    for number, rollouts in enumerate(collector):
         mixture.share = 0.5 ** (number + 1)  # the expert's in the next round
-        data = flights.select(*policy.in_keys, EXPERT, strict=False)
-        buffer.extend(as_windows(data, policy.window, every=1))
+        data = rollouts.select(*policy.in_keys, EXPERT, strict=False)
+        buffer.extend(as_windows(data, policy.window, stride=1))
         losses = []
         for _ in range(updates):
             loss = imitation_loss(policy, buffer.sample(), everybody, expert_action=EXPERT)
@@ -141,8 +141,8 @@ def main(
             optimiser.step()
             losses.append(loss.item())
         print(f"round {number + 1}: loss {sum(losses) / updates:.4f}")
-    results["policy"] = fly(policy, *size)
-    results["expert"] = fly(TensorDictModule(keep_right, [OBSERVATION], [ACTION]), *size)
+    results["policy"] = rollout(policy, *size)
+    results["expert"] = rollout(TensorDictModule(keep_right, [OBSERVATION], [ACTION]), *size)
     for name, (error, total) in results.items():
         print(f"{name}: error {error:.4f}, return {total:.3f}")
     return results

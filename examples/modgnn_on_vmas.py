@@ -125,12 +125,12 @@ def main(
     optimiser = torch.optim.Adam(loss_module.parameters(), lr=1e-3)
 
     returns: list[float] = []
-    for flights in collector:
-        returns.append(flights["next", "agents", "reward"].sum(1).mean().item())
+    for rollouts in collector:
+        returns.append(rollouts["next", "agents", "reward"].sum(1).mean().item())
         print(f"iteration {len(returns)}: return {returns[-1]:.3f}")
         with torch.no_grad():
-            loss_module.value_estimator(flights)
-        buffer.extend(flights)
+            loss_module.value_estimator(rollouts)
+        buffer.extend(rollouts)
         for _ in range(epochs):
             for batch in buffer:
                 losses = loss_module(batch)

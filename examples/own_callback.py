@@ -47,7 +47,7 @@ class StopWhenGood(Callback):
 
     def on_round(self, index: int, metrics: Mapping[str, float]) -> bool:
         """Whether to stop."""
-        return metrics.get("expert_share") == 0 and metrics["8/error"] < self.error
+        return metrics.get("beta") == 0 and metrics["8/error"] < self.error
 
 
 def main(error: float = 0.02, runs: Path = Path("runs"), steps: int = 480, **trainer: Any) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def main(error: float = 0.02, runs: Path = Path("runs"), steps: int = 480, **tra
     Args:
         error: m²/s², at which to stop.
         runs: folder for the run folder.
-        steps: of the flights of the evaluation.
+        steps: of the rollouts of the evaluation.
         trainer: settings of `DAggerConfig`.
 
     Returns:

@@ -3,8 +3,8 @@
     python examples/own_dagger.py
     python examples/own_dagger.py --schedule linear --gate near
 
-A sequence of modules flies: the policy acts, the expert labels, `Mixture` lets one of the two fly each flock, a
-`SafetyGate` lets the expert take over, and `Disturbance` adds noise. Every visited state is kept in TorchRL's replay
+A sequence of modules flies: the policy acts, the expert labels, `BetaMixture` lets one of the two fly each flock, a
+`SafetyGate` lets the expert take over, and `ActionNoise` adds noise. Every visited state is kept in TorchRL's replay
 buffer, and the policy learns from all of them. A schedule is any function of the round, a gate any function that says
 how badly each flock flies. ``python -m modgnn_rl.train`` is the same loop with more to it: a moving average of the
 weights, a falling learning rate, rotations, several sizes, checkpoints.
@@ -26,9 +26,9 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.metrics import smallest_distance
-from modgnn_rl.evaluation.rollout import fly
-from modgnn_rl.trainers.collectors.behaviour import Disturbance, Mixture, SafetyGate, disagreement
+from modgnn_rl.envs.flocking.metrics import min_distance
+from modgnn_rl.evaluation.rollout import rollout
+from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, SafetyGate, disagreement
 from modgnn_rl.trainers.collectors.windows import as_windows
 from modgnn_rl.trainers.common.sampling import random_receivers
 from modgnn_rl.trainers.imitation.loss import imitation_loss
@@ -36,7 +36,7 @@ from modgnn_rl.trainers.imitation.loss import imitation_loss
 
 def nearness(tensordict: TensorDictBase) -> Tensor:
     """A measure of one's own: how near the two nearest agents of each flock are, -m [*B]."""
-    return -smallest_distance(tensordict["agents", "observation"][..., :3])
+    return -min_distance(tensordict["agents", "observation"][..., :3])
 
 
 SCHEDULES: dict[str, Callable[[int], float]] = {
@@ -62,13 +62,13 @@ def main(
     test_steps: int = 240,
     seed: int = 0,
 ) -> list[float]:
-    """Train a policy; returns its error on flights of its own after each round, m²/s²."""
-    world = FlockingConfig()
-    policy, expert = make_model("pair_force", seed=seed), Reynolds.for_env(world)
+    """Train a policy; returns its error on rollouts of its own after each round, m²/s²."""
+    env_config = FlockingConfig()
+    policy, expert = make_model("pair_force", seed=seed), Reynolds.for_env(env_config)
     generator = torch.Generator().manual_seed(seed)
-    mixture, disturbance = Mixture(1.0, steps, generator), Disturbance(0.05, generator)
+    mixture, disturbance = BetaMixture(1.0, steps, generator), ActionNoise(0.05, generator)
     collector = Collector(
-        FlockingEnv(num_envs, num_agents, config=world, seed=seed, stagger=True),
+        FlockingEnv(num_envs, num_agents, config=env_config, seed=seed, stagger=True),
         TensorDictSequential(policy, expert, mixture, *GATES[gate], disturbance),
         frames_per_batch=num_envs * steps,
         total_frames=num_envs * steps * rounds,
@@ -78,9 +78,9 @@ def main(
     optimiser = torch.optim.Adam(policy.parameters(), lr=2e-3)
 
     errors: list[float] = []
-    for flights in collector:
+    for rollouts in collector:
         # The last action of such a window is exact, whatever messages older weights have sent before it.
-        buffer.extend(as_windows(flights, policy.window, every=2))
+        buffer.extend(as_windows(rollouts, policy.window, stride=2))
         for _ in range(updates):
             batch = buffer.sample()
             receivers = random_receivers(batch["agents", "controlled"][:, -1], 8, generator)
@@ -88,11 +88,11 @@ def main(
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
-        test = fly(policy, world, num_agents=num_agents, num_flocks=8, steps=test_steps, seed=1_000_000)
+        test = rollout(policy, env_config, num_agents=num_agents, num_flocks=8, steps=test_steps, seed=1_000_000)
         errors.append(test.error.mean().item())
-        expert_flew = flights["expert_flies"].float().mean().item()
+        expert_flew = rollouts["expert_flies"].float().mean().item()
         print(f"round {len(errors)}: the expert flew {expert_flew:4.0%}, then error {errors[-1]:.4f} m²/s²")
-        mixture.share = SCHEDULES[schedule](len(errors))
+        mixture.beta = SCHEDULES[schedule](len(errors))
     return errors
 
 
@@ -105,6 +105,6 @@ if __name__ == "__main__":
     parser.add_argument("--steps", type=int, default=40, help="steps flown in each round")
     parser.add_argument("--rounds", type=int, default=16)
     parser.add_argument("--updates", type=int, default=60, help="gradient steps in each round")
-    parser.add_argument("--test-steps", type=int, default=240, help="steps of the flights that are tested on")
+    parser.add_argument("--test-steps", type=int, default=240, help="steps of the rollouts that are tested on")
     parser.add_argument("--seed", type=int, default=0)
     main(**vars(parser.parse_args()))

@@ -3,7 +3,7 @@
     python examples/own_f_com.py
 
 The f_com below is the expert's rule for one neighbour, with its three gains left open. They are fitted to the expert's
-forces on flights of the expert, then the policy flies by itself. Agents that hear everybody find the expert's own
+forces on rollouts of the expert, then the policy flies by itself. Agents that hear everybody find the expert's own
 gains, 0.06, 0.8 and 0.02. Agents that hear only their neighbours find gains that make up for those whom they do not
 hear.
 """
@@ -43,8 +43,10 @@ class Force(nn.Module):
         return torch.stack((offset * distance, -offset / distance**3, drift * speed), -1) @ self.gains
 
 
-def fly(policy: TensorDictModuleBase, comm_range: float, num_envs: int, num_agents: int, steps: int) -> TensorDictBase:
-    """Flights [B, T], and at every state the expert's forces: its actions before they are clipped to `MAX_SPEED`."""
+def rollout(
+    policy: TensorDictModuleBase, comm_range: float, num_envs: int, num_agents: int, steps: int
+) -> TensorDictBase:
+    """Rollouts [B, T], and at every state the expert's forces: its actions before they are clipped to `MAX_SPEED`."""
     env = TransformedEnv(FlockingEnv(num_envs, num_agents, seed=0, comm_range=comm_range), InitTracker())
     if isinstance(policy, ModGNN):
         env.append_transform(policy.make_tensordict_primer())
@@ -53,23 +55,23 @@ def fly(policy: TensorDictModuleBase, comm_range: float, num_envs: int, num_agen
         return forces(env.rollout(steps, policy))
 
 
-def error(policy: ModGNN, flights: TensorDictBase, f_final: nn.Module | None = None) -> Tensor:
+def error(policy: ModGNN, rollouts: TensorDictBase, f_final: nn.Module | None = None) -> Tensor:
     """Mean squared difference to the expert's forces; what ``f_final`` makes of these, if it is given."""
     with set_recurrent_mode(True):
-        action = policy(flights.select(*policy.in_keys, strict=False))["agents", "action"]
-    forces = flights["agents", "force"]
+        action = policy(rollouts.select(*policy.in_keys, strict=False))["agents", "action"]
+    forces = rollouts["agents", "force"]
     difference = action - (forces if f_final is None else f_final(forces))
     # Agent 0 is the leader, whom nobody flies; at the first step nobody has heard anybody yet.
     return difference[:, 1:, 1:].square().mean()
 
 
-def fit(policy: ModGNN, flights: TensorDictBase) -> None:
+def fit(policy: ModGNN, rollouts: TensorDictBase) -> None:
     """Least squares by L-BFGS."""
     optimiser = torch.optim.LBFGS(policy.parameters(), max_iter=30, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        value = error(policy, flights)
+        value = error(policy, rollouts)
         value.backward()
         return value
 
@@ -82,20 +84,20 @@ def main(
     """Fit and fly a policy for each range of hearing, m.
 
     Returns:
-        gains, and error of the policy's actions on its own flights, m²/s², for each range.
+        gains, and error of the policy's actions on its own rollouts, m²/s², for each range.
     """
     results = {}
     head = BallHead(MAX_SPEED)
-    print("hears, m   cohesion   separation   alignment   error on its own flights, m²/s²")
+    print("hears, m   cohesion   separation   alignment   error on its own rollouts, m²/s²")
     for comm_range in comm_ranges:
         f_com = Force()
         policy = ModGNN(ModGNNLayer(hops=1, f_com=f_com, f_pre=[Zero(3), None]))
         size = (comm_range, num_envs, num_agents, steps)
-        fit(policy, fly(Reynolds(action=("agents", "action")), *size))
+        fit(policy, rollout(Reynolds(action=("agents", "action")), *size))
         policy.layers[0].f_final = head
         gains = f_com.gains.tolist()
         with torch.no_grad():
-            results[comm_range] = gains, error(policy, fly(policy, *size), head).item()
+            results[comm_range] = gains, error(policy, rollout(policy, *size), head).item()
         print("{:8g} {:10.3f} {:12.3f} {:11.3f} {:17.5f}".format(comm_range, *gains, results[comm_range][1]))
     return results
 

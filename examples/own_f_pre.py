@@ -78,7 +78,7 @@ def main(
     """Train a policy.
 
     Returns:
-        its error on each round's flights before it learns from them, and the last one if nobody knew its role, m²/s².
+        its error on each round's rollouts before it learns from them, and the last one if nobody knew its role, m²/s².
     """
     torch.manual_seed(seed)
     policy, expert = make_policy(), make_expert()
@@ -97,23 +97,23 @@ def main(
     optimiser = torch.optim.Adam(policy.parameters(), lr=3e-3)
 
     errors: list[float] = []
-    for flights in collector:
-        expert(flights)
+    for rollouts in collector:
+        expert(rollouts)
         with torch.no_grad():
-            errors.append(error(policy, flights).item())
+            errors.append(error(policy, rollouts).item())
         print(f"round {len(errors)}: error {errors[-1]:.4f} m²/s²")
         # Single states are enough: what this policy sends holds no trace of its weights (policy.sends_plain_data), so
         # that stored messages stay exact while it learns. Other policies learn from windows, see modgnn_on_vmas.py.
-        buffer.extend(flights.flatten())
+        buffer.extend(rollouts.flatten())
         for _ in range(updates):
             loss = error(policy, buffer.sample())
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
-    flights["agents", "role"] = torch.zeros_like(flights["agents", "role"])
+    rollouts["agents", "role"] = torch.zeros_like(rollouts["agents", "role"])
     with torch.no_grad():
-        ignorant = error(policy, flights).item()
-    print(f"the same flights, if nobody knew its role: error {ignorant:.4f} m²/s²")
+        ignorant = error(policy, rollouts).item()
+    print(f"the same rollouts, if nobody knew its role: error {ignorant:.4f} m²/s²")
     return errors, ignorant
 
 

@@ -24,7 +24,7 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.rewards import flocking_costs, flocking_reward
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.trainers.ppo.critic import FlockCritic
-from modgnn_rl.trainers.ppo.loss import AnchoredMAPPOLoss
+from modgnn_rl.trainers.ppo.loss import KLPenaltyMAPPOLoss
 from modgnn_rl.utils.tensors import pair_distances
 
 WEIGHTS = {"spacing": 1.0, "cohesion": 0.02, "collision": 1.0, "alignment": 0.2, "effort": 0.02}  # of the costs
@@ -61,8 +61,8 @@ def main(
     torch.manual_seed(seed)
     actor, critic = GaussianActor(make_model("pair_force"), noise=0.3), FlockCritic()
     # An action lasts 1/12 s here, so that what it does is felt within few steps.
-    world = FlockingConfig(max_steps=steps, control_frequency=12.0, physics_substeps=20)
-    env = TransformedEnv(FlockingEnv(num_envs, num_agents, config=world, seed=seed), OwnReward())
+    env_config = FlockingConfig(max_steps=steps, control_frequency=12.0, physics_substeps=20)
+    env = TransformedEnv(FlockingEnv(num_envs, num_agents, config=env_config, seed=seed), OwnReward())
     collector = Collector(
         env,
         actor,
@@ -71,7 +71,7 @@ def main(
         auto_register_policy_transforms=True,  # makes the messages recurrent state of the environment
     )
     # TorchRL's MAPPOLoss; it also pulls towards actions under ("agents", "anchor"), where the data have them.
-    loss_module = AnchoredMAPPOLoss(actor, critic, functional=False, normalize_advantage=True)
+    loss_module = KLPenaltyMAPPOLoss(actor, critic, functional=False, normalize_advantage=True)
     loss_module.set_keys(
         action=("agents", "action"),
         reward=("agents", "reward"),
@@ -86,14 +86,14 @@ def main(
     optimiser = torch.optim.Adam(loss_module.parameters(), lr=1e-3)
 
     rewards: list[float] = []
-    for flights in collector:
-        flown = flights["agents", "controlled"]
-        flights["collector", "mask"] = flown.unsqueeze(-1)  # the leader flies as it likes
-        rewards.append(flights["next", "agents", "reward"][flown].mean().item())
+    for rollouts in collector:
+        flown = rollouts["agents", "controlled"]
+        rollouts["collector", "mask"] = flown.unsqueeze(-1)  # the leader flies as it likes
+        rewards.append(rollouts["next", "agents", "reward"][flown].mean().item())
         print(f"round {len(rewards)}: reward {rewards[-1]:.3f}, noise {actor.noise:.2f} m/s")
         with torch.no_grad():
-            loss_module.value_estimator(flights)
-        buffer.extend(flights)
+            loss_module.value_estimator(rollouts)
+        buffer.extend(rollouts)
         for _ in range(epochs):
             for batch in buffer:
                 losses = loss_module(batch)
@@ -110,7 +110,7 @@ if __name__ == "__main__":
     parser.add_argument("--num-agents", type=int, default=8, help="agents in each, the leader included")
     parser.add_argument("--steps", type=int, default=60, help="steps flown in each round, from the start")
     parser.add_argument("--rounds", type=int, default=30)
-    parser.add_argument("--epochs", type=int, default=4, help="passes over the flights of one round")
+    parser.add_argument("--epochs", type=int, default=4, help="passes over the rollouts of one round")
     parser.add_argument("--batches", type=int, default=4, help="parts of such a pass")
     parser.add_argument("--seed", type=int, default=0)
     main(**vars(parser.parse_args()))

@@ -1,4 +1,4 @@
-"""``python -m modgnn_rl.collect episodes=1000``: the expert's flights as a dataset to keep."""
+"""``python -m modgnn_rl.collect episodes=1000``: the expert's rollouts as a dataset to keep."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from modgnn_rl.configs.schema import CollectConfig
 
 
 def main(config: CollectConfig) -> None:
-    """Fly the expert and write its flights to a dataset that trainer=bc reads; started again, it goes on.
+    """Fly the expert and write its rollouts to a dataset that trainer=bc reads; started again, it goes on.
 
     Examples::
 

@@ -1,4 +1,4 @@
-"""``python -m modgnn_rl.replay run=<folder>``: a flight of a run's policy to look at."""
+"""``python -m modgnn_rl.replay run=<folder>``: a rollout of a run's policy to look at."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from modgnn_rl.cli.command import run_command
-from modgnn_rl.configs.schema import ReplayConfig, WorldChanges, as_list
+from modgnn_rl.configs.schema import EnvOverrides, ReplayConfig, as_list
 from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.run_folder import RunFolder
 
@@ -16,7 +16,7 @@ EXTRAS = {"mp4": "video", "svg": "plots", "png": "plots"}
 
 
 def main(config: ReplayConfig) -> None:
-    """Fly a flock with a trained policy, and write a page, a film or a picture of it, beside the expert's flight.
+    """Fly a flock with a trained policy, and write a page, a film or a picture of it, beside the expert's rollout.
 
     Examples::
 
@@ -28,7 +28,7 @@ def main(config: ReplayConfig) -> None:
     from modgnn_rl.experiment.replay import replay_run
 
     path = replay_run(config)
-    what = {"html": "flight", "mp4": "film"}.get(config.format, "picture")
+    what = {"html": "rollout", "mp4": "film"}.get(config.format, "picture")
     print(f"The {what} is in {path}")
     if config.format == "html":
         print(f"Next: python -m webbrowser {path.as_uri()}")
@@ -65,4 +65,4 @@ def refuse(config: ReplayConfig) -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, ReplayConfig, "replay", nodes={"env/changes": WorldChanges})
+    run_command(main, ReplayConfig, "replay", nodes={"env/changes": EnvOverrides})

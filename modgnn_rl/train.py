@@ -28,14 +28,16 @@ def main(config: TrainConfig) -> None:
     if config.resume is None:
         RunFolder.check_root(config.runs)
     from modgnn_rl.experiment.training import resume, train
-    from modgnn_rl.trainers.common.distributed import say
+    from modgnn_rl.trainers.common.distributed import print_rank0
 
     if config.resume is None:
         run = train(config)
     else:
         run = resume(config.resume, {key: value for key, value in settings_given(config).items() if key != "resume"})
-    say(f"Policy, metrics and table are in {run.path}")
-    say(f"Next: python -m modgnn_rl.evaluate {shlex.quote(f'run={run.path}')} 'evaluation.num_agents=[8,16,64]'")
+    print_rank0(f"Policy, metrics and table are in {run.path}")
+    print_rank0(
+        f"Next: python -m modgnn_rl.evaluate {shlex.quote(f'run={run.path}')} 'evaluation.num_agents=[8,16,64]'"
+    )
 
 
 if __name__ == "__main__":

@@ -65,21 +65,21 @@ def test_the_loss_of_the_vmas_example_sees_the_messages_that_were_flown():
     critic: TensorDictModule = module.make_critic(num_agents=3)
     loss_module = module.make_loss(actor, critic)
     size = {"frames_per_batch": 4 * 10, "total_frames": 4 * 30}
-    for number, flights in enumerate(Collector(env, actor, **size, auto_register_policy_transforms=True)):
-        begins = flights["is_init"].squeeze(-1)
+    for number, rollouts in enumerate(Collector(env, actor, **size, auto_register_policy_transforms=True)):
+        begins = rollouts["is_init"].squeeze(-1)
         assert begins.any(1).all()
-        assert (flights["messages"].flatten(2).nan_to_num().abs().sum(-1) > 0)[~begins].all()
+        assert (rollouts["messages"].flatten(2).nan_to_num().abs().sum(-1) > 0)[~begins].all()
         if number:
             assert not begins[:, 0].all()  # batches go on where the last one stopped
         with torch.no_grad():
-            loss_module.value_estimator(flights)
-            losses = loss_module(flights)
+            loss_module.value_estimator(rollouts)
+            losses = loss_module(rollouts)
         # The policy has not changed, so what it does in a window is what it did step by step.
         assert losses["kl_approx"].abs().max() < 1e-5
         assert losses["clip_fraction"] == 0
-    flights["messages"].zero_()
+    rollouts["messages"].zero_()
     with torch.no_grad():
-        assert loss_module(flights)["kl_approx"].abs().max() > 1e-4  # the messages before the window count
+        assert loss_module(rollouts)["kl_approx"].abs().max() > 1e-4  # the messages before the window count
 
 
 def test_a_policy_imitates_an_expert_of_ones_own_on_vmas():
@@ -126,8 +126,8 @@ def test_own_reward_counts_what_it_says():
 
 
 def test_own_callback_stops_early_and_learns_from_an_expert_that_keeps_more_distance(tmp_path, capsys):
-    small = {"batch_size": 16, "cloning_steps": 20, "cloning_updates": 5, "round_steps": 20, "round_updates": 2}
-    figures = example("own_callback").main(error=1.0, runs=tmp_path, steps=20, expert_rounds=1, **small)
+    small = {"batch_size": 16, "cloning_steps": 20, "cloning_updates": 5, "steps_per_round": 20, "updates_per_round": 2}
+    figures = example("own_callback").main(error=1.0, runs=tmp_path, steps=20, beta_rounds=1, **small)
     assert figures["8"]["rows"]["expert"]["error"]["mean"] == 0
     printed = capsys.readouterr().out
     assert "round 2: error" in printed

@@ -1,4 +1,4 @@
-"""Behaviour cloning: fit the expert's actions on the expert's own flights, as the paper did."""
+"""Behaviour cloning: fit the expert's actions on the expert's own rollouts, as the paper did."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import ReplayBuffer
 
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
-from modgnn_rl.data.dataset import FlightDataset
-from modgnn_rl.evaluation.rollout import fly
+from modgnn_rl.data.dataset import EpisodeDataset
+from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.checkpoint import save_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.collectors.flocks import Flocks, flocks_of_all_sizes, named_flocks, validation_flocks
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer, make_buffers, make_validation_buffers, named_buffers
 from modgnn_rl.trainers.common import distributed
-from modgnn_rl.trainers.imitation.learner import Learner, fit_together, validate_together
-from modgnn_rl.trainers.loop.context import Session
+from modgnn_rl.trainers.imitation.learner import ImitationLearner, fit_together, validate_together
+from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.trainers.loop.setup import DART_PARTS, make_learner, side_by_side
-from modgnn_rl.trainers.loop.training_loop import Journal
+from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["bc"]
@@ -33,20 +33,20 @@ FLIGHT_ROUNDS = 20  # parts after which the policies fly
 FLIGHT_STEPS = 250  # how long
 
 
-def bc(session: Session) -> dict[str, ModGNN]:
+def bc(context: TrainContext) -> dict[str, ModGNN]:
     """Train policies by behaviour cloning, one or several side by side on the same batches.
 
-    The expert's flights come from a dataset, or are flown first. The validation error is taken on flights that are not
-    trained on. It says little of how a policy flies: it never meets the states that its own errors lead to.
+    The expert's rollouts come from a dataset, or are flown first. The validation error is taken on rollouts that are
+    not trained on. It says little of how a policy flies: it never meets the states that its own errors lead to.
 
     Args:
-        session: the run, ``session.config.trainer`` being a `BCConfig`; with several policies, a run folder of each
+        context: the run, ``context.config.trainer`` being a `BCConfig`; with several policies, a run folder of each
             lies in the run's.
 
     Returns:
         the trained policies, the moving averages of the weights, by name.
     """
-    config, expert = session.config, session.expert
+    config, expert = context.config, context.expert
     settings: BCConfig = config.trainer
     sizes = config.env.sizes
     each = settings.cloning_updates // len(sizes)
@@ -55,31 +55,31 @@ def bc(session: Session) -> dict[str, ModGNN]:
     updates = rounds * fitting * len(sizes)
     members = side_by_side(config)
     by_name = {name: make_learner(member, (updates, updates)) for name, member in members.items()}
-    learners, policies = list(by_name.values()), [learner.flown for learner in by_name.values()]
+    learners, policies = list(by_name.values()), [learner.ema_policy for learner in by_name.values()]
     parts = DART_PARTS if settings.dart else 1
-    flown: dict[str, Any] = {"steps": max(1, settings.cloning_steps // parts), "stretch": settings.cloning_steps}
-    held_out = validation_flocks(config, policies, expert, **flown)
-    training = {} if settings.dataset else flocks_of_all_sizes(config, policies, expert, **flown)
+    flown: dict[str, Any] = {"steps": max(1, settings.cloning_steps // parts), "hold_steps": settings.cloning_steps}
+    held_out = make_validation_buffers(config, policies, expert, **flown)
+    training = {} if settings.dataset else make_buffers(config, policies, expert, **flown)
     flights_at = [part * rounds // parts for part in range(parts)]
 
     with (
-        _own_folders(session.run, members, by_name),
-        Journal(session, by_name, named_flocks(training, held_out), updates) as journal,
+        _own_folders(context.run, members, by_name),
+        TrainingLoop(context, by_name, named_buffers(training, held_out), updates) as loop,
     ):
         buffers = {size: group.buffer for size, group in training.items()}
         if settings.dataset:
             buffers = {sizes[0]: _share(settings, held_out[sizes[0]], max(policy.window for policy in policies))}
-        for index in journal.rounds(1, rounds):
+        for index in loop.rounds(1, rounds):
             for size, group in training.items():
                 for _ in range(max(flights_at.count(index - 1), not group.seen)):
                     learned = settings.dart and index > 1
-                    group.disturbance.scale = journal.memory["validation_loss"] ** 0.5 if learned else settings.noise
-                    group.keep(journal.show(group.fly(expert_share=1.0)))
+                    group.action_noise.scale = loop.state["validation_loss"] ** 0.5 if learned else settings.noise
+                    group.keep(loop.on_collect(group.fly(beta=1.0)))
                 for _ in range(parts if not held_out[size].seen else 0):
-                    held_out[size].keep(held_out[size].fly(expert_share=1.0))
+                    held_out[size].keep(held_out[size].fly(beta=1.0))
             metrics = {"learning_rate": learners[0].learning_rate}
             for group in training.values():
-                metrics["noise"] = group.disturbance.scale
+                metrics["noise"] = group.action_noise.scale
             losses: dict[str, list[float]] = {name: [] for name in by_name}
             for size, buffer in buffers.items():
                 unseen = held_out[size].buffer
@@ -96,14 +96,16 @@ def bc(session: Session) -> dict[str, ModGNN]:
                     metrics |= _errors_in_flight(config, by_name, size, expert)
             metrics["gradient_norm"] = learners[0].gradient_norm
             scores = {name: sum(values) / len(values) for name, values in losses.items()}
-            metrics["validation_loss"] = journal.memory["validation_loss"] = sum(scores.values()) / len(scores)
-            journal.note(metrics, fitting * len(sizes), scores, validation_loss=metrics["validation_loss"])
+            metrics["validation_loss"] = loop.state["validation_loss"] = sum(scores.values()) / len(scores)
+            loop.log(metrics, fitting * len(sizes), scores, validation_loss=metrics["validation_loss"])
 
     return dict(zip(by_name, policies, strict=True))
 
 
 @contextlib.contextmanager
-def _own_folders(run: RunFolder, members: Mapping[str, TrainConfig], by_name: Mapping[str, Learner]) -> Iterator[None]:
+def _own_folders(
+    run: RunFolder, members: Mapping[str, TrainConfig], by_name: Mapping[str, ImitationLearner]
+) -> Iterator[None]:
     """At the end, after Ctrl-C too, give each of several policies a run folder of its own inside the run's."""
 
     def write() -> None:
@@ -111,7 +113,7 @@ def _own_folders(run: RunFolder, members: Mapping[str, TrainConfig], by_name: Ma
             own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
             learner = by_name[name]
             if learner.updates_done:  # a run stopped before it went on leaves what it had
-                save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.flown.state_dict()}, {})
+                save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.ema_policy.state_dict()}, {})
 
     try:
         yield
@@ -131,14 +133,14 @@ def _named(by_name: dict[str, Any], metric: str, values: Sequence[float]) -> dic
 def _errors_in_flight(
     config: TrainConfig, by_name: dict[str, Any], size: int, expert: TensorDictModuleBase
 ) -> dict[str, float]:
-    """The error of each policy on short flights of its own, from the same starts."""
+    """The error of each policy on short rollouts of its own, from the same starts."""
     settings: BCConfig = config.trainer
-    flights = [
-        fly(
-            learner.flown,
+    rollouts = [
+        rollout(
+            learner.ema_policy,
             config.env,
             num_agents=size,
-            num_flocks=settings.held_out,
+            num_flocks=settings.num_val_envs,
             steps=min(FLIGHT_STEPS, settings.cloning_steps),
             seed=derive_seed(config.seed, "validation"),
             device=config.device,
@@ -146,17 +148,17 @@ def _errors_in_flight(
         )
         for learner in by_name.values()
     ]
-    return _named(by_name, f"{size}/error", [float(flight.error.mean()) for flight in flights])
+    return _named(by_name, f"{size}/error", [float(rollout.error.mean()) for rollout in rollouts])
 
 
-def _share(settings: BCConfig, unseen: Flocks, window: int) -> ReplayBuffer:
-    """Share a dataset's flights: the last ``held_out`` become the data of ``unseen``, the others are returned.
+def _share(settings: BCConfig, unseen: FlockBuffer, window: int) -> ReplayBuffer:
+    """Share a dataset's rollouts: the last ``held_out`` become the data of ``unseen``, the others are returned.
 
     A dataset holds no messages: windows make them anew.
     """
     # `check_training` has verified it.
-    dataset = FlightDataset.open(str(settings.dataset), verify=False, device=unseen.device)
-    seen = dataset.episodes - settings.held_out
+    dataset = EpisodeDataset.open(str(settings.dataset), verify=False, device=unseen.device)
+    seen = dataset.episodes - settings.num_val_envs
     draws: dict[str, Any] = {
         "length": window,
         "batch_size": settings.batch_size,

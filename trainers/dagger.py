@@ -8,21 +8,21 @@ from typing import Any
 
 from modgnn_rl.configs.schema import DAggerConfig
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.collectors.behaviour import SafetyGate, disagreement, expert_share, spread
-from modgnn_rl.trainers.collectors.flocks import flocks_of_all_sizes, named_flocks, validation_flocks
+from modgnn_rl.trainers.collectors.behaviour import SafetyGate, beta_schedule, disagreement, ensemble_std
+from modgnn_rl.trainers.collectors.flocks import make_buffers, make_validation_buffers, named_buffers
 from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
 from modgnn_rl.trainers.loop.callbacks import StopOnPlateau
-from modgnn_rl.trainers.loop.context import Session
-from modgnn_rl.trainers.loop.metrics import flight_metrics
+from modgnn_rl.trainers.loop.context import TrainContext
+from modgnn_rl.trainers.loop.metrics import rollout_metrics
 from modgnn_rl.trainers.loop.setup import make_learner
-from modgnn_rl.trainers.loop.training_loop import Journal
+from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 
 __all__ = ["dagger"]
 
-GATES = {"disagreement": disagreement, "ensemble": spread}
+GATES = {"disagreement": disagreement, "ensemble": ensemble_std}
 
 
-def dagger(session: Session) -> dict[str, ModGNN]:
+def dagger(context: TrainContext) -> dict[str, ModGNN]:
     """Train a policy with DAgger.
 
     The expert flies first and the policy clones it. Then, round by round, mixture and policy go on flying the same
@@ -30,62 +30,62 @@ def dagger(session: Session) -> dict[str, ModGNN]:
     goes on over all of it. What flies, and what is returned, is the moving average of the policy's weights.
 
     Args:
-        session: the run, ``session.config.trainer`` being a `DAggerConfig`.
+        context: the run, ``context.config.trainer`` being a `DAggerConfig`.
 
     Returns:
         the trained policy, by the name of its model.
     """
-    config = session.config
+    config = context.config
     settings: DAggerConfig = config.trainer
     sizes = config.env.sizes
     cloning = settings.cloning_updates // len(sizes)
-    fitting = settings.round_updates // len(sizes)
+    fitting = settings.updates_per_round // len(sizes)
     updates = (cloning + settings.rounds * fitting) * len(sizes)
     members = settings.ensemble if settings.gate == "ensemble" else 1
     learners = [make_learner(config, (cloning * len(sizes), updates), member) for member in range(members)]
-    cloning_stretches = math.ceil(settings.cloning_steps / settings.round_steps)
+    cloning_stretches = math.ceil(settings.cloning_steps / settings.steps_per_round)
     gate = None if settings.gate == "none" else SafetyGate(GATES[settings.gate], settings.gate_threshold)
-    policies, expert = [learner.flown for learner in learners], session.expert
-    flown: dict[str, Any] = {"steps": settings.round_steps, "stretch": settings.stretch}
-    flocks = flocks_of_all_sizes(config, policies, expert, **flown, gate=gate)
-    held_out = validation_flocks(config, policies, expert, **flown)
+    policies, expert = [learner.ema_policy for learner in learners], context.expert
+    flown: dict[str, Any] = {"steps": settings.steps_per_round, "hold_steps": settings.hold_steps}
+    flocks = make_buffers(config, policies, expert, **flown, gate=gate)
+    held_out = make_validation_buffers(config, policies, expert, **flown)
     if settings.plateau_rounds:
-        plateau = StopOnPlateau(settings.plateau_rounds, settings.plateau_gain, after=settings.expert_rounds)
-        session = dataclasses.replace(session, callbacks=[*session.callbacks, plateau])
+        plateau = StopOnPlateau(settings.plateau_rounds, settings.plateau_gain, after=settings.beta_rounds)
+        context = dataclasses.replace(context, callbacks=[*context.callbacks, plateau])
 
     names = [config.model.name, *(f"ensemble_{member}" for member in range(1, members))]
     by_name = dict(zip(names, learners, strict=True))
-    with Journal(session, by_name, named_flocks(flocks, held_out), updates) as journal:
-        for index in journal.rounds(0, settings.rounds):
-            share = 1.0 if index == 0 else share_of_expert(settings, index - 1)
+    with TrainingLoop(context, by_name, named_buffers(flocks, held_out), updates) as loop:
+        for index in loop.rounds(0, settings.rounds):
+            share = 1.0 if index == 0 else beta_of_round(settings, index - 1)
             stretches, count = (cloning_stretches, cloning) if index == 0 else (1, fitting)
-            metrics = {"learning_rate": learners[0].learning_rate, "expert_share": share}
+            metrics = {"learning_rate": learners[0].learning_rate, "beta": share}
             for size, group in flocks.items():
                 for _ in range(stretches):
-                    flights = journal.show(group.fly(share))
-                    group.keep(flights)
+                    rollouts = loop.on_collect(group.fly(share))
+                    group.keep(rollouts)
                 for _ in range(cloning_stretches if not held_out[size].seen else 0):
-                    held_out[size].keep(held_out[size].fly(expert_share=1.0))
+                    held_out[size].keep(held_out[size].fly(beta=1.0))
                 if index == 0:
                     group.mixture.restart()
-                metrics |= flight_metrics(flights, config.env)
+                metrics |= rollout_metrics(rollouts, config.env)
                 metrics[f"{size}/loss"], *_ = fit_together(learners, group.buffer, count)
                 metrics[f"{size}/validation_loss"], *_ = validate_together(learners, held_out[size].buffer)
                 metrics[f"{size}/states"] = len(group.buffer)
             metrics["error"] = error = sum(metrics[f"{size}/error"] for size in sizes) / len(sizes)
             metrics["gradient_norm"] = learners[0].gradient_norm
             round_ = f"{index}/{settings.rounds}"
-            journal.note(metrics, count * len(sizes), {names[0]: error}, round=round_, error=error)
+            loop.log(metrics, count * len(sizes), {names[0]: error}, round=round_, error=error)
 
-    return {names[0]: learners[0].flown}
+    return {names[0]: learners[0].ema_policy}
 
 
-def share_of_expert(settings: DAggerConfig, index: int) -> float:
+def beta_of_round(settings: DAggerConfig, index: int) -> float:
     """The expert's share of the flying time in a round, counted from 0 after the cloning."""
-    return expert_share(
+    return beta_schedule(
         settings.schedule,
         index,
-        start=settings.expert_share,
-        decay=settings.share_decay,
-        last_round=settings.expert_rounds,
+        start=settings.beta,
+        decay=settings.beta_decay,
+        last_round=settings.beta_rounds,
     )

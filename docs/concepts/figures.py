@@ -1,4 +1,4 @@
-"""Make the figures of these pages, from flights and trainings of their own.
+"""Make the figures of these pages, from rollouts and trainings of their own.
 
     python docs/concepts/figures.py
     python docs/concepts/figures.py delayed-messages local-policies
@@ -27,15 +27,15 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl import ModGNN, load_policy, make_model
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, EvaluationConfig, FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
-from modgnn_rl.envs.flocking.metrics import action_error, is_lost
-from modgnn_rl.evaluation.rollout import endless_env
+from modgnn_rl.envs.flocking.metrics import action_error, leader_lost
+from modgnn_rl.evaluation.rollout import make_eval_env
 from modgnn_rl.experiment.training import train
 from modgnn_rl.reporting.figure import GRID, INK, PAPER, draw, styles_of
 from modgnn_rl.reporting.plots import Curve, draw_curves, draw_panels
 from modgnn_rl.utils.seeds import seeded
 
 HERE = Path(__file__).parent
-BIN = 20  # steps of a flight that make one point of a curve
+BIN = 20  # steps of a rollout that make one point of a curve
 ACTION, EXPERT_ACTION = ("agents", "action"), ("agents", "expert_action")
 
 
@@ -93,16 +93,16 @@ def delayed_messages(figure: Figure) -> None:
 
 
 def errors(
-    policy: TensorDictModuleBase, world: FlockingConfig, *, flocks: int, steps: int, flown_by_expert: bool = False
+    policy: TensorDictModuleBase, env_config: FlockingConfig, *, flocks: int, steps: int, flown_by_expert: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The error of a policy's actions over time, on flights of its own or of the expert, from the same fresh starts.
+    """The error of a policy's actions over time, on rollouts of its own or of the expert, from the same fresh starts.
 
     Returns:
         errors, m^2/s^2, and shares of the time at which nobody heard the leader, in bins of `BIN` steps
         [flocks, bins].
     """
-    expert, size = Reynolds.for_env(world), world.sizes[0]
-    env = endless_env(policy, world, flocks, size, steps=steps, seed=1_000_000)
+    expert, size = Reynolds.for_env(env_config), env_config.sizes[0]
+    env = make_eval_env(policy, env_config, flocks, size, steps=steps, seed=1_000_000)
     found, lost = [], []
     state = env.reset()
     with torch.no_grad(), set_recurrent_mode(False):
@@ -110,7 +110,7 @@ def errors(
             state = expert(policy(state))
             agents = state["agents"]
             found.append(action_error(agents["action"], agents["expert_action"], agents["controlled"]))
-            lost.append(is_lost(agents["observation"][..., :3], world.comm_range).double())
+            lost.append(leader_lost(agents["observation"][..., :3], env_config.comm_range).double())
             if flown_by_expert:
                 state[ACTION] = state[EXPERT_ACTION]
             state = env.step_mdp(env.step(state))
@@ -119,23 +119,23 @@ def errors(
     return binned[0], binned[1]
 
 
-def curves(values: Mapping[str, np.ndarray], world: FlockingConfig) -> dict[str, Curve]:
+def curves(values: Mapping[str, np.ndarray], env_config: FlockingConfig) -> dict[str, Curve]:
     """Means over flocks [flocks, bins] with their 95 % intervals, over seconds."""
     rng = np.random.default_rng(0)
-    length = BIN / world.control_frequency
+    length = BIN / env_config.control_frequency
     return {
         name: Curve.over_seeds((np.arange(flown.shape[1]) + 0.5) * length, flown, rng=rng)
         for name, flown in values.items()
     }
 
 
-def trained(world: FlockingConfig, trainer: Any, finished: Path | None) -> ModGNN:
+def trained(env_config: FlockingConfig, trainer: Any, finished: Path | None) -> ModGNN:
     """A policy whose robots hear over one link, of a finished run or trained now."""
     if finished is not None:
         return load_policy(finished)
     with tempfile.TemporaryDirectory() as runs:
         config = TrainConfig(
-            env=world,
+            env=env_config,
             model=ModelConfig(name="modgnn_mlp"),
             trainer=trainer,
             evaluation=EvaluationConfig(num_flocks=2, steps=4),
@@ -145,23 +145,23 @@ def trained(world: FlockingConfig, trainer: Any, finished: Path | None) -> ModGN
 
 
 def compounding_errors(cloned: Path | None = None, dagger: Path | None = None) -> Callable[[Figure], None]:
-    """Two policies of the paper's model, cloned and trained by DAgger, on the expert's flights and on their own."""
-    world = FlockingConfig()
+    """Two policies of the paper's model, cloned and trained by DAgger, on the expert's rollouts and on their own."""
+    env_config = FlockingConfig()
     policies: dict[str, TensorDictModuleBase] = {
-        "cloned": trained(world, BCConfig(), cloned),
-        "DAgger": trained(world, DAggerConfig(rounds=60), dagger),
-        "expert, 1 hop": LocalReynolds.for_env(world, action=ACTION),
+        "cloned": trained(env_config, BCConfig(), cloned),
+        "DAgger": trained(env_config, DAggerConfig(rounds=60), dagger),
+        "expert, 1 hop": LocalReynolds.for_env(env_config, action=ACTION),
     }
-    titles = {"on the expert's flights": True, "on flights of its own": False}
+    titles = {"on the expert's rollouts": True, "on rollouts of its own": False}
     panels = {}
     for title, flown_by_expert in titles.items():
         found = {
-            name: errors(policy, world, flocks=40, steps=1000, flown_by_expert=flown_by_expert)[0]
+            name: errors(policy, env_config, flocks=40, steps=1000, flown_by_expert=flown_by_expert)[0]
             for name, policy in policies.items()
         }
         for name, values in found.items():
             print(f"{title}: {name} {values.mean():.3f} m²/s²")
-        panels[title] = curves(found, world)
+        panels[title] = curves(found, env_config)
 
     def onto(figure: Figure) -> None:
         for panel, drawn in zip(draw_panels(figure, list(titles)), panels.values(), strict=True):
@@ -170,7 +170,7 @@ def compounding_errors(cloned: Path | None = None, dagger: Path | None = None) -
                 drawn,
                 x_label="time, s",
                 y_label="error, m²/s²",
-                references={"zero action": world.max_speed**2 / 3},
+                references={"zero action": env_config.max_speed**2 / 3},
             )
 
     return onto
@@ -178,17 +178,17 @@ def compounding_errors(cloned: Path | None = None, dagger: Path | None = None) -
 
 def local_policies() -> Callable[[Figure], None]:
     """The expert's own rule with the eyes of a local policy."""
-    world = FlockingConfig()
+    env_config = FlockingConfig()
     experts = {
-        "expert, 1 hop": LocalReynolds.for_env(world, hops=1, action=ACTION),
-        "expert, 2 hops": LocalReynolds.for_env(world, hops=2, action=ACTION),
-        "expert, sees all": Reynolds.for_env(world, action=ACTION),
+        "expert, 1 hop": LocalReynolds.for_env(env_config, hops=1, action=ACTION),
+        "expert, 2 hops": LocalReynolds.for_env(env_config, hops=2, action=ACTION),
+        "expert, sees all": Reynolds.for_env(env_config, action=ACTION),
     }
-    flown = {name: errors(expert, world, flocks=100, steps=1000) for name, expert in experts.items()}
+    flown = {name: errors(expert, env_config, flocks=100, steps=1000) for name, expert in experts.items()}
     for name, (error, lost) in flown.items():
         print(f"{name}: {error.mean():.3f} m²/s², at the end {error[:, -1].mean():.3f}, lost {lost[:, -1].mean():.0%}")
-    errors_of = curves({name: error for name, (error, _) in flown.items()}, world)
-    lost_of = curves({name: 100 * lost for name, (_, lost) in flown.items()}, world)
+    errors_of = curves({name: error for name, (error, _) in flown.items()}, env_config)
+    lost_of = curves({name: 100 * lost for name, (_, lost) in flown.items()}, env_config)
 
     def onto(figure: Figure) -> None:
         left, right = draw_panels(

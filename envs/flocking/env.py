@@ -54,7 +54,7 @@ class FlockingEnv(EnvBase):
     - ``("agents", "state")`` [B, N, 6]: the true position and velocity, where sensors are noisy or late;
     - ``("agents", "mask")`` [B, N] bool: the agents that are there, where agents drop out or flocks differ in size.
 
-    ``reset(tensordict, set_state=True)`` begins the flights at the positions and velocities under
+    ``reset(tensordict, set_state=True)`` begins the rollouts at the positions and velocities under
     ``("agents", "state")``, or else under ``("agents", "observation")``.
 
     Args:
@@ -62,11 +62,11 @@ class FlockingEnv(EnvBase):
         num_agents: agents N in each flock; default: the configuration's. With several numbers, flocks take them in
             turns, N is the largest, and the rows that are left over are masked and zero.
         config: all other settings; default: ``FlockingConfig(**settings)``.
-        seed: seed of the environment's own generators; equal seeds give equal flights, bit for bit.
+        seed: seed of the environment's own generators; equal seeds give equal rollouts, bit for bit.
         device: where the environment lives.
         dtype: floating-point type of the physics and of everything emitted.
         stagger: let each flock's first episode end at a random step, so that a batch of long-lived flocks holds all
-            phases of the flight at once.
+            phases of the rollout at once.
         settings: fields of `FlockingConfig`, when no ``config`` is given.
 
     Attributes:
@@ -319,7 +319,7 @@ class FlockingEnv(EnvBase):
         return action.to(self.dtype)
 
     def snapshot(self) -> dict[str, Tensor]:
-        """A copy of all that the flights continue from, but for `generator` and ``faults.generator``.
+        """A copy of all that the rollouts continue from, but for `generator` and ``faults.generator``.
 
         Returns:
             by name, such as ``"physics.position"`` [B, N, 3] or ``"step_count"`` [B, 1].

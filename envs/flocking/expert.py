@@ -18,7 +18,7 @@ from torch import Tensor
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.graph import Graph
-from modgnn_rl.nn.primer import AgentCache, missing
+from modgnn_rl.nn.primer import RecurrentStatePrimer, missing
 from modgnn_rl.nn.topology import Topology, as_matrix, reachable
 from modgnn_rl.utils.compile import compiled
 from modgnn_rl.utils.tensors import clip_to_ball, is_transformed, pair_blocks, pair_differences, squared_norm
@@ -70,7 +70,7 @@ def reynolds(
     state = [value.reshape(-1, agents, 3) for value in (position, velocity)]
     mask = None if mask is None else mask.expand(*batch, agents).reshape(-1, agents)
     if visible is not None and visible.dtype == torch.int64:
-        force = _forces_over_links(state, Topology(visible, agents, mask=mask, form="links").everyone(), gains)
+        force = _forces_over_links(state, Topology(visible, agents, mask=mask, form="links").all_edges(), gains)
     else:
         seen = None if visible is None else visible.expand(*batch, agents, agents).reshape(-1, agents, agents)
         force = _forces_of_pairs(state, seen, mask, gains)
@@ -99,9 +99,9 @@ def _forces_of_pairs(
 def _forces_over_links(state: list[Tensor], links: Graph, gains: tuple[float, float, float]) -> Tensor:
     """The sum of the rule over links; [B * N, 3]."""
     nodes = [value.flatten(0, 1) for value in state]
-    offset, drift = (links.at_senders(node) - links.at_receivers(node) for node in nodes)
+    offset, drift = (links.gather_senders(node) - links.gather_receivers(node) for node in nodes)
     force = _pair_forces(offset.t().contiguous().unbind(), drift.t().contiguous().unbind(), gains)
-    return links.total(torch.stack(force, -1))
+    return links.scatter_sum(torch.stack(force, -1))
 
 
 def _pair_forces(offset: Sequence[Tensor], drift: Sequence[Tensor], gains: tuple[float, float, float]) -> list[Tensor]:
@@ -243,9 +243,9 @@ class LocalReynolds(Reynolds):
         action = self.rule(last[..., :3], last[..., 3:], visible, heard)
         return tensordict.set(self.out_keys[0], action).set(self.out_keys[1], observation)
 
-    def make_tensordict_primer(self) -> AgentCache:
+    def make_tensordict_primer(self) -> RecurrentStatePrimer:
         """The transform that gives an environment this module's recurrent state."""
-        return AgentCache(self, [self.cache], is_init=self.in_keys[2])
+        return RecurrentStatePrimer(self, [self.cache], is_init=self.in_keys[2])
 
 
 def _gains_of(config: FlockingConfig) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """What goes wrong outside: lost and late messages, uneven radios, noisy sensors, agents that drop out, gusts.
 
 Policies see it only through adjacency, observation and mask, so that each of them copes with it unchanged. All faults
-are off by default, and draw from a generator of their own: flights with and without them have the same starts and the
+are off by default, and draw from a generator of their own: rollouts with and without them have the same starts and the
 same leaders.
 """
 

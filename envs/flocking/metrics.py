@@ -19,12 +19,12 @@ from modgnn_rl.utils.tensors import pair_blocks, pair_differences, squared_norm
 __all__ = [
     "action_error",
     "cohesion",
+    "collision_rate",
     "is_diverged",
-    "is_lost",
     "leader_distance",
-    "near_collisions",
+    "leader_lost",
+    "min_distance",
     "separation",
-    "smallest_distance",
 ]
 
 
@@ -96,7 +96,7 @@ def separation(position: Tensor) -> Tensor:
     return nearest.sqrt().reshape(position.shape[:-1])
 
 
-def smallest_distance(position: Tensor) -> Tensor:
+def min_distance(position: Tensor) -> Tensor:
     """Distance of the closest pair, ``min_{i < j} |p_i - p_j|``.
 
     Args:
@@ -108,7 +108,7 @@ def smallest_distance(position: Tensor) -> Tensor:
     return separation(position).amin(-1)
 
 
-def near_collisions(position: Tensor, distance: float) -> Tensor:
+def collision_rate(position: Tensor, distance: float) -> Tensor:
     """Number of pairs ``i < j`` with ``|p_i - p_j| < distance``.
 
     Args:
@@ -141,7 +141,7 @@ def is_diverged(position: Tensor, max_distance: float, exists: Tensor | None = N
     return ~(distance <= max_distance).all(-1)  # written so that a NaN counts as diverged
 
 
-def is_lost(position: Tensor, comm_range: float, leader: int = 0) -> Tensor:
+def leader_lost(position: Tensor, comm_range: float, leader: int = 0) -> Tensor:
     """Whether the flock has lost its leader: nobody is within ``comm_range`` of it.
 
     Args:

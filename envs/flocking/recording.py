@@ -1,4 +1,4 @@
-"""What is kept of a flight to be looked at later: where everybody was, what it was told, who heard whom."""
+"""What is kept of a rollout to be looked at later: where everybody was, what it was told, who heard whom."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[Any]
 
 QUANTUM = 2.0**-10  # m; positions are kept as multiples of it, so that distances are the same whoever computes them
 FARTHEST = 2**28  # quanta; who is farther away is drawn there
-MOST_STATES = 200_000  # agents x steps of a flight that are kept unless somebody asks for more
+MOST_STATES = 200_000  # agents x steps of a rollout that are kept unless somebody asks for more
 METRICS = {
     "error": ("Error against the expert", "m²/s²"),
     "leader_distance": ("Leader to the others' centre", "m"),
@@ -32,7 +32,7 @@ METRICS = {
 
 @dataclass(frozen=True)
 class Recording:
-    """A flight of N agents, the leader first, at T steps.
+    """A rollout of N agents, the leader first, at T steps.
 
     Attributes:
         position: in quanta, int32 [T, N, 3].
@@ -42,7 +42,7 @@ class Recording:
         flips: for each step the links ``receiver * N + sender`` in which the radio graph differs from "within
             ``comm_range`` of each other, by these positions, and both present"; ascending.
         metrics: by the names of `METRICS`, [T].
-        every: steps from one that was kept to the next.
+        stride: steps from one that was kept to the next.
         comm_range: m.
         max_speed: m/s.
         frequency: control steps a second, Hz.
@@ -53,7 +53,7 @@ class Recording:
     present: Array
     flips: list[Array]
     metrics: dict[str, Array]
-    every: int
+    stride: int
     comm_range: float
     max_speed: float
     frequency: float
@@ -80,23 +80,23 @@ def links_in_range(position: Array, present: Array, comm_range: float) -> Array:
 
 @dataclass
 class Recorder:
-    """Keeps one flock of the flights that `modgnn_rl.evaluation.rollout.fly` shows it, step by step.
+    """Keeps one flock of the rollouts that `modgnn_rl.evaluation.rollout.rollout` shows it, step by step.
 
     Args:
         config: the world.
-        every: steps from one that is kept to the next.
+        stride: steps from one that is kept to the next.
         flock: which flock.
     """
 
     config: FlockingConfig
-    every: int = 1
+    stride: int = 1
     flock: int = 0
     seen: int = field(default=0, init=False)
     kept: list[dict[str, Array]] = field(default_factory=list, init=False)
 
     def __call__(self, tensordict: TensorDictBase) -> None:
         """Look at the flocks before a step, with the policy's and the expert's actions."""
-        if self.seen % self.every == 0:
+        if self.seen % self.stride == 0:
             self.kept.append(self._look(tensordict[self.flock]))
         self.seen += 1
 
@@ -135,7 +135,7 @@ class Recorder:
             present=np.stack(parts["present"]),
             flips=parts["flips"],
             metrics={"error": np.stack(parts["error"])} | {name: value.numpy() for name, value in shape.items()},
-            every=self.every,
+            stride=self.stride,
             comm_range=self.config.comm_range,
             max_speed=self.config.max_speed,
             frequency=self.config.control_frequency,

@@ -1,7 +1,7 @@
 """What flocking is for, as a reward: follow the leader, keep together, keep apart, move as one, with little effort.
 
 It knows nothing of the expert. Each purpose is a cost of its own, zero at best; the reward is their weighted sum below
-zero. `judge` adds whether a flight is over.
+zero. `judge` adds whether a rollout is over.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def judge(
         weights: of the costs, see `reward_weights`.
 
     Returns:
-        state [B, N, 6], reward [B, N, 1], and whether the flight is over [B, 1].
+        state [B, N, 6], reward [B, N, 1], and whether the rollout is over [B, 1].
     """
     touching = nearest < limits["collision_distance"]
     colliding = touching.sum(-1) > limits["max_colliding"] * sizes

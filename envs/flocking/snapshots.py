@@ -1,6 +1,6 @@
-"""What flights continue from, as named tensors: taken apart, and put back where it fits.
+"""What rollouts continue from, as named tensors: taken apart, and put back where it fits.
 
-Flights that are interrupted and restored go on bit for bit when the generators of the environment are set too.
+Rollouts that are interrupted and restored go on bit for bit when the generators of the environment are set too.
 """
 
 from __future__ import annotations

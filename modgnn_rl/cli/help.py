@@ -82,7 +82,7 @@ def _settings(config: DictConfig, width: int, prefix: str = "") -> Iterator[list
             value = raw[field.name]
             shown = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
             head = f"{prefix}{field.name}={'<required>' if value == '???' else shown}"
-            lines.append(_entry(head, f"{field.metadata.get('doc', '')}{legal_values(field.metadata)}", width))
+            lines.append(_entry(head, f"{field.metadata.get('help', '')}{legal_values(field.metadata)}", width))
     yield lines
     # The shortest first: the long list of the world's would hide the others.
     for name in sorted(nested, key=lambda name: len(nested[name])):
@@ -108,6 +108,6 @@ def legal_values(rule: Mapping[str, Any]) -> str:
     """The legal values of a setting in brackets, or an empty string."""
     if rule.get("choices"):
         return f" [{', '.join(map(str, rule['choices']))}]"
-    words = {"low": "at least", "above": "greater than", "high": "at most"}
+    words = {"ge": "at least", "gt": "greater than", "le": "at most"}
     bounds = [f"{word} {rule[key]}" for key, word in words.items() if rule.get(key) is not None]
     return f" [{', '.join(bounds)}]" if bounds else ""

@@ -54,7 +54,7 @@ def overview() -> str:
             for name, text in found.items()
         ),
         "",
-        "Try first: a few minutes of training, which end with a table and a flight",
+        "Try first: a few minutes of training, which end with a table and a rollout",
         *(f"  python -m modgnn_rl.{name} {settings}".rstrip() for name, settings in FIRST.items()),
         "",
         "Every choice and every setting of a command",

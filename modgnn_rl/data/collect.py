@@ -1,4 +1,4 @@
-"""Writing the expert's flights to a dataset, shard by shard, so that a stopped collection can go on."""
+"""Writing the expert's rollouts to a dataset, shard by shard, so that a stopped collection can go on."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from modgnn_rl.utils.files import fsync_file, fsync_folder
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["collect", "fly_expert", "report"]
+__all__ = ["collect", "report", "rollout_expert"]
 
 MARGIN = 2**24  # bytes that stay free on the disk
 LEFTOVER = re.compile(r"shard_\d{5,}\.tmp|\.manifest\.json\.\d+\.tmp")  # of a process that was killed
@@ -52,7 +52,7 @@ def collect(config: CollectConfig) -> Path:
     check(config)
     prepare_torch(config.device, config.threads)
     wanted = Manifest(
-        world=recordable(config.env, config.steps or config.env.max_steps),
+        env_config=recordable(config.env, config.steps or config.env.max_steps),
         seed=config.seed,
         num_envs=config.num_envs,
         steps=config.steps or config.env.max_steps,
@@ -83,7 +83,7 @@ def _kept_shards(folder: Path, wanted: Manifest) -> dict[str, dict[str, Any]]:
         return {}
     found = Manifest.read(folder)
     if different := found.differences(wanted.settings):
-        raise InputError(f"{folder} holds flights with other settings: {different}; give output=<another folder>")
+        raise InputError(f"{folder} holds rollouts with other settings: {different}; give output=<another folder>")
     if found.episodes > wanted.episodes:
         raise InputError(
             f"{folder} is for {found.episodes} episodes, more than episodes={wanted.episodes}; give at least as many, "
@@ -111,7 +111,8 @@ def _check_space(folder: Path, size: int) -> None:
     free = shutil.disk_usage(there).free
     if size and free < size + MARGIN:
         raise InputError(
-            f"the flights take {size / 1e6:,.0f} MB and the disk of {folder} has {free / 1e6:,.0f} MB free; make room, "
+            f"the rollouts take {size / 1e6:,.0f} MB and the disk of {folder} has {free / 1e6:,.0f} MB free; make "
+            f"room, "
             "lower episodes or steps, or give output=<folder on another disk>"
         )
 
@@ -128,9 +129,9 @@ def _fly_shards(folder: Path, manifest: Manifest, missing: dict[str, tuple[int, 
         try:
             for name, (episodes, steps, agents, _) in missing.items():
                 if env is None or env.batch_size[0] != episodes:
-                    env = FlockingEnv(episodes, agents, config=manifest.world, device=manifest.device)
+                    env = FlockingEnv(episodes, agents, config=manifest.env_config, device=manifest.device)
                 env.set_seed(derive_seed(manifest.seed, name))
-                states = fly_expert(env, steps, progress)
+                states = rollout_expert(env, steps, progress)
                 _check_space(folder, num_bytes(states.shape))
                 _write_shard(folder / name, states)
                 manifest.shards[name] = describe_files(folder / name)
@@ -163,11 +164,11 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @torch.no_grad()
-def fly_expert(env: FlockingEnv, steps: int, progress: Progress | None = None) -> Tensor:
-    """Fly the expert from fresh starts; nothing ends a flight early.
+def rollout_expert(env: FlockingEnv, steps: int, progress: Progress | None = None) -> Tensor:
+    """Fly the expert from fresh starts; nothing ends a rollout early.
 
     Args:
-        env: B flocks of N agents; their generators decide the flights.
+        env: B flocks of N agents; their generators decide the rollouts.
         steps: steps T.
         progress: counts flock-steps.
 
@@ -179,7 +180,7 @@ def fly_expert(env: FlockingEnv, steps: int, progress: Progress | None = None) -
     tensordict = env.reset()
     for step in range(steps):
         states[:, step] = tensordict["agents", "observation"]
-        # A plain loop: only a reset, which does not happen here, would end a flight.
+        # A plain loop: only a reset, which does not happen here, would end a rollout.
         tensordict = env.step_mdp(env.step(expert(tensordict)))
         if progress is not None:
             progress.update(len(states))
@@ -211,7 +212,7 @@ def report(folder: Path) -> str:
     ]
     command = shlex.join(["python", "-m", "modgnn_rl.train", "trainer=bc", f"trainer.dataset={folder}", *changed])
     return (
-        f"{manifest.episodes} flights of {manifest.steps} steps with {manifest.num_agents} agents are in {folder} "
+        f"{manifest.episodes} rollouts of {manifest.steps} steps with {manifest.num_agents} agents are in {folder} "
         f"({size / 1e6:,.1f} MB)\nNext: {command}"
     )
 

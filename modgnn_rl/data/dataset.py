@@ -1,8 +1,8 @@
-"""The expert's flights from a folder that ``python -m modgnn_rl.collect`` made.
+"""The expert's rollouts from a folder that ``python -m modgnn_rl.collect`` made.
 
 Example::
 
-    dataset = FlightDataset.open("datasets/32-agents")
+    dataset = EpisodeDataset.open("datasets/32-agents")
     buffer = dataset.buffer(length=2, batch_size=256, generator=torch.Generator().manual_seed(0))
     batch = buffer.sample()  # windows [256, 2] with the keys of FlockingEnv and the expert's actions
 
@@ -29,9 +29,9 @@ from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.tensors import pair_distances
 
-__all__ = ["WITHOUT_EFFECT", "FlightDataset", "FlightWindows"]
+__all__ = ["WITHOUT_EFFECT", "EpisodeDataset", "EpisodeWindows"]
 
-# Settings of a world that neither flights, nor graphs as matrices, nor the expert's actions depend on.
+# Settings of a world that neither rollouts, nor graphs as matrices, nor the expert's actions depend on.
 WITHOUT_EFFECT = (
     "max_steps",
     "max_links",
@@ -43,32 +43,32 @@ WITHOUT_EFFECT = (
 )
 
 
-class FlightDataset:
-    """Flights of flocks of one size in one world; open it with `open`.
+class EpisodeDataset:
+    """Rollouts of flocks of one size in one world; open it with `open`.
 
     Attributes:
         path: the folder.
         manifest: its manifest.
-        world: the world of the flights.
-        episodes: number of flights, E.
+        env_config: the world of the rollouts.
+        episodes: number of rollouts, E.
         steps: steps of each, T.
         num_agents: agents in each, N.
-        shards: the flights, memory-mapped TensorDicts [E_k, T] that hold "state" [E_k, T, N, 6]: positions, m, and
+        shards: the rollouts, memory-mapped TensorDicts [E_k, T] that hold "state" [E_k, T, N, 6]: positions, m, and
             velocities, m/s. Changes of them stay in this process.
         device: where `windows` puts its result.
     """
 
     def __init__(self, path: Path, manifest: Manifest, shards: list[TensorDict], device: torch.device | str) -> None:
         self.path, self.manifest, self.shards = path, manifest, shards
-        self.world: FlockingConfig = manifest.world
+        self.env_config: FlockingConfig = manifest.env_config
         self.episodes, self.steps, self.num_agents = manifest.episodes, manifest.steps, manifest.num_agents
         self.device = torch.device(device)
-        self._expert = Reynolds.for_env(dataclasses.replace(self.world, compile=False))
+        self._expert = Reynolds.for_env(dataclasses.replace(self.env_config, compile=False))
 
     @classmethod
     def open(
         cls, path: str | os.PathLike[str], *, verify: bool = True, device: torch.device | str = "cpu"
-    ) -> FlightDataset:
+    ) -> EpisodeDataset:
         """Open a complete and undamaged dataset; nothing is loaded that could run code.
 
         Args:
@@ -101,30 +101,30 @@ class FlightDataset:
             shards.append(TensorDict({"state": state.view(shape)}, shape[:2]))
         return cls(path, manifest, shards, device)
 
-    def check_world(self, world: FlockingConfig) -> None:
-        """Refuse to serve another world than the one of the flights.
+    def check_world(self, env_config: FlockingConfig) -> None:
+        """Refuse to serve another world than the one of the rollouts.
 
         Raises:
             InputError: with the settings that differ.
         """
-        wanted = {name: value for name, value in vars(world).items() if name not in WITHOUT_EFFECT}
+        wanted = {name: value for name, value in vars(env_config).items() if name not in WITHOUT_EFFECT}
         size = as_list(wanted["num_agents"])
         wanted["num_agents"] = size[0] if len(size) == 1 else size
         different = self.manifest.differences({f"env.{name}": value for name, value in wanted.items()})
         if different:
             raise InputError(
-                f"the flights in {self.path} are of another world than env: {different}; set these as they are there, "
-                "or collect flights of this world"
+                f"the rollouts in {self.path} are of another world than env: {different}; set these as they are there, "
+                "or collect rollouts of this world"
             )
 
     def __len__(self) -> int:
-        """Number of flock states, E T; state t of flight e has the index e T + t."""
+        """Number of flock states, E T; state t of rollout e has the index e T + t."""
         return self.episodes * self.steps
 
     def states(self, index: Tensor, length: int) -> Tensor:
         """Positions and velocities of the ``length`` steps up to each index, on the CPU.
 
-        Steps before the start of a flight show its first state.
+        Steps before the start of a rollout show its first state.
 
         Args:
             index: indices of flock states, int64 [S].
@@ -151,9 +151,9 @@ class FlightDataset:
         return states
 
     def windows(self, index: Tensor, length: int) -> TensorDict:
-        """Windows of flights as `FlockingEnv` shows them, with the expert's actions.
+        """Windows of rollouts as `FlockingEnv` shows them, with the expert's actions.
 
-        A window that begins before its flight repeats the first state, and says each time that an episode begins
+        A window that begins before its rollout repeats the first state, and says each time that an episode begins
         there, so that a policy has heard of nobody; a window of ``policy.window`` steps has exact actions at its end.
 
         Args:
@@ -169,12 +169,12 @@ class FlightDataset:
         controlled = torch.ones(states.shape[:-1], dtype=torch.bool, device=self.device)
         controlled[..., 0] = False
         agents = TensorDict({"observation": states, "controlled": controlled}, states.shape[:2])
-        adjacency = pair_distances(states[..., :3]) <= self.world.comm_range
+        adjacency = pair_distances(states[..., :3]) <= self.env_config.comm_range
         windows = TensorDict({"agents": agents, "adjacency": adjacency, "is_init": is_init}, states.shape[:2])
         return self._expert(windows)
 
     def _steps(self, index: Tensor, length: int) -> Tensor:
-        """The steps that windows show, [S, W]; those before the start of the flight are negative."""
+        """The steps that windows show, [S, W]; those before the start of the rollout are negative."""
         return (index % self.steps).unsqueeze(-1) + torch.arange(1 - length, 1, device=index.device)
 
     def buffer(
@@ -190,11 +190,11 @@ class FlightDataset:
         Args:
             length: steps of each window.
             batch_size: windows in a batch.
-            episodes: flights to draw from, without gaps; default: all.
+            episodes: rollouts to draw from, without gaps; default: all.
             generator: source of randomness; default: torch's own.
         """
         return ReplayBuffer(
-            storage=FlightWindows(self, length, range(self.episodes) if episodes is None else episodes, generator),
+            storage=EpisodeWindows(self, length, range(self.episodes) if episodes is None else episodes, generator),
             sampler=RandomSampler(),
             writer=ImmutableDatasetWriter(),
             collate_fn=_as_it_is,  # a batch is made whole
@@ -203,25 +203,25 @@ class FlightDataset:
         )
 
 
-class FlightWindows(Storage):
-    """Some flights of a dataset as a storage for TorchRL's replay buffers; item i is the window that ends at state i.
+class EpisodeWindows(Storage):
+    """Some rollouts of a dataset as a storage for TorchRL's replay buffers; item i is the window that ends at state i.
 
     TorchRL's ``TensorStorage`` over the mapped states would serve single states. Windows reach over several of them,
-    back to the start of the flight and no further, and graphs and labels are made for the states of a batch only:
+    back to the start of the rollout and no further, and graphs and labels are made for the states of a batch only:
     stored they would take 50 times the space.
 
     Args:
-        dataset: the flights.
+        dataset: the rollouts.
         length: steps of each window.
-        episodes: the flights to serve, without gaps.
+        episodes: the rollouts to serve, without gaps.
         generator: draws the indices.
 
     Raises:
-        InputError: the dataset does not have these flights.
+        InputError: the dataset does not have these rollouts.
     """
 
     def __init__(
-        self, dataset: FlightDataset, length: int, episodes: range, generator: torch.Generator | None = None
+        self, dataset: EpisodeDataset, length: int, episodes: range, generator: torch.Generator | None = None
     ) -> None:
         if not 0 <= episodes.start < episodes.stop <= dataset.episodes or episodes.step != 1:
             raise InputError(f"{episodes} are not some of the {dataset.episodes} episodes of {dataset.path}")
@@ -235,7 +235,7 @@ class FlightWindows(Storage):
         return self.max_size
 
     def get(self, index: Any) -> TensorDictBase:
-        """The windows [S, W] that end at these states [S] of the flights, or the one [W] that ends at one state."""
+        """The windows [S, W] that end at these states [S] of the rollouts, or the one [W] that ends at one state."""
         index = torch.as_tensor(index)
         windows = self.dataset.windows(index.view(-1) + self.episodes.start * self.dataset.steps, self.length)
         return windows if index.ndim else windows[0]

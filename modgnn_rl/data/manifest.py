@@ -1,4 +1,4 @@
-"""The manifest of a dataset of flights: what was flown, and what every file of it must be.
+"""The manifest of a dataset of rollouts: what was flown, and what every file of it must be.
 
 One dataset is a folder::
 
@@ -58,7 +58,7 @@ class Manifest:
     """What a dataset is made of; `read` and `write` keep it in ``manifest.json``.
 
     Attributes:
-        world: the world of the flights, all settings resolved.
+        env_config: the world of the rollouts, all settings resolved.
         seed: each shard was flown with the seed ``derive_seed(seed, name)``.
         num_envs: episodes in each shard but the last, flown at once.
         steps: steps of an episode, T.
@@ -67,7 +67,7 @@ class Manifest:
         shards: for each shard that is there, by name, the SHA-256 and the size of its files, and what wrote them.
     """
 
-    world: FlockingConfig
+    env_config: FlockingConfig
     seed: int
     num_envs: int
     steps: int
@@ -78,14 +78,14 @@ class Manifest:
     @property
     def num_agents(self) -> int:
         """Agents of a flock, N."""
-        return int(self.world.num_agents)
+        return int(self.env_config.num_agents)
 
     @property
     def settings(self) -> dict[str, Any]:
         """All that decides what is in a shard, by the names of the command line."""
-        world = {f"env.{name}": value for name, value in dataclasses.asdict(self.world).items()}
-        del world["env.max_steps"]  # these are the steps
-        return {**world, "seed": self.seed, "num_envs": self.num_envs, "steps": self.steps, "device": self.device}
+        env_config = {f"env.{name}": value for name, value in dataclasses.asdict(self.env_config).items()}
+        del env_config["env.max_steps"]  # these are the steps
+        return {**env_config, "seed": self.seed, "num_envs": self.num_envs, "steps": self.steps, "device": self.device}
 
     def differences(self, settings: Mapping[str, Any]) -> str:
         """Which of these settings are others here, as ``name=value (there value)`` with commas between; or nothing."""
@@ -121,7 +121,7 @@ class Manifest:
         file = folder / MANIFEST
         if not file.is_file():
             raise InputError(
-                f"{folder} is no dataset of flights, it has no {MANIFEST}; python -m modgnn_rl.collect makes one"
+                f"{folder} is no dataset of rollouts, it has no {MANIFEST}; python -m modgnn_rl.collect makes one"
             )
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
@@ -140,10 +140,12 @@ class Manifest:
             raise ValueError("it has changed since it was written, says its SHA-256")
         known = {name: value for name, value in content.items() if name not in _DERIVED}
         # JSON has no infinity; FlockingConfig has no setting that may be called so.
-        world: dict[str, Any]
-        world = {name: float(value) if value in ("inf", "-inf") else value for name, value in known["world"].items()}
-        manifest = cls(**{**known, "world": FlockingConfig(**world)})
-        check(manifest.world, "world")
+        env_config: dict[str, Any]
+        env_config = {
+            name: float(value) if value in ("inf", "-inf") else value for name, value in known["env_config"].items()
+        }
+        manifest = cls(**{**known, "env_config": FlockingConfig(**env_config)})
+        check(manifest.env_config, "env_config")
         for name in ("num_envs", "steps", "episodes", "num_agents"):
             if type(count := getattr(manifest, name)) is not int or count < 1:
                 raise ValueError(f"{name} is {count}")
@@ -159,9 +161,9 @@ class Manifest:
         content: dict[str, Any] = derived | {
             entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)
         }
-        content["world"] = {
+        content["env_config"] = {
             name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in dataclasses.asdict(self.world).items()
+            for name, value in dataclasses.asdict(self.env_config).items()
         }
         content["shards"] = dict(sorted(self.shards.items()))
         write_atomically(folder / MANIFEST, json.dumps({**content, "sha256": _digest(content)}, indent=2) + "\n")
@@ -217,20 +219,22 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def recordable(world: FlockingConfig, steps: int) -> FlockingConfig:
-    """The world of a dataset of flights of so many steps.
+def recordable(env_config: FlockingConfig, steps: int) -> FlockingConfig:
+    """The world of a dataset of rollouts of so many steps.
 
     Raises:
         InputError: a flock cannot be known from positions and velocities in this world.
     """
-    if len(world.sizes) > 1:
-        raise InputError(f"env.num_agents={world.sizes} are several sizes; a dataset has one, collect one for each")
-    hidden = [f"env.{name}={getattr(world, name)}" for name in UNSEEN if getattr(world, name)]
-    if world.graph != "matrix":
-        hidden.append(f"env.graph={world.graph}")
+    if len(env_config.sizes) > 1:
+        raise InputError(
+            f"env.num_agents={env_config.sizes} are several sizes; a dataset has one, collect one for each"
+        )
+    hidden = [f"env.{name}={getattr(env_config, name)}" for name in UNSEEN if getattr(env_config, name)]
+    if env_config.graph != "matrix":
+        hidden.append(f"env.graph={env_config.graph}")
     if hidden:
         raise InputError(
             f"a dataset holds positions and velocities, which do not tell what agents see with {', '.join(hidden)}; "
-            "leave it out, or train with trainer=dagger, which collects its own flights"
+            "leave it out, or train with trainer=dagger, which collects its own rollouts"
         )
-    return dataclasses.replace(world, num_agents=world.sizes[0], max_steps=steps)
+    return dataclasses.replace(env_config, num_agents=env_config.sizes[0], max_steps=steps)

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.nn.aggregation import Hop, Tables, aggregate, call
-from modgnn_rl.nn.graph import Pairs
+from modgnn_rl.nn.aggregation import Hop, NodeFeatures, aggregate, call
+from modgnn_rl.nn.graph import DenseGraph
 from modgnn_rl.nn.layer import ModGNNLayer, only_finite
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.utils.tensors import keep_rows
+from modgnn_rl.utils.tensors import mask_rows
 
 __all__ = ["Agent", "LinkData", "check_local", "link_data", "no_messages", "own_data", "step"]
 
@@ -71,7 +71,7 @@ class Agent:
     def reset(self) -> None:
         """Forget everything: a reboot, or the start of an episode."""
         self._messages: Tensor | None = None
-        self._seen: tuple[Tensor, Tables] | None = None
+        self._seen: tuple[Tensor, NodeFeatures] | None = None
         self._heard: dict[str, Tensor] | None = None
 
     @torch.no_grad()
@@ -177,7 +177,7 @@ def step(
     hears = torch.arange(stored.shape[0], device=stored.device) > 0
     weight = None if weight is None else pad(weight, (1, 0))
     feature = None if feature is None else pad(feature, (0, 0, 1, 0))
-    links = Pairs(hears.view(1, 1, -1), weight, feature)
+    links = DenseGraph(hears.view(1, 1, -1), weight, feature)
     holds = stored.isfinite().all(-1)
     stored = torch.where(holds.unsqueeze(-1), stored, 0.0)
 
@@ -193,7 +193,7 @@ def step(
 
 
 def _layer_step(
-    layer: ModGNNLayer, observation: Tensor, own: Tables, stored: Tensor, holds: Tensor, links: Pairs
+    layer: ModGNNLayer, observation: Tensor, own: NodeFeatures, stored: Tensor, holds: Tensor, links: DenseGraph
 ) -> tuple[Tensor, Tensor]:
     """One layer, as `ModGNNLayer` defines it, for the one receiver of a graph.
 
@@ -215,7 +215,7 @@ def _layer_step(
     total = call(layer.f_mid[0], call(layer.f_pre[0], data.clone(), tables), tables)
     sent = []
     for hop in range(1, layer.hops + 1):
-        sent.append(keep_rows(data, held, torch.nan).to(seen.dtype)[0])
+        sent.append(mask_rows(data, held, torch.nan).to(seen.dtype)[0])
         senders, they_hold = _of_width(stored[:, hop - 1], data.shape[-1]), holds[:, hop - 1]
         if layer.start == "zero":
             they_hold = torch.ones_like(they_hold)
@@ -225,8 +225,8 @@ def _layer_step(
         if hop < layer.hops:  # before f_pre works on the messages, maybe in place
             data = aggregate(graph, f_com, nn.Identity(), incoming, layer.aggregation)
         summed = aggregate(graph, f_com, layer.f_pre[hop], incoming, layer.aggregation)
-        total = total + keep_rows(call(layer.f_mid[hop], summed, tables), held)
-    output = keep_rows(call(layer.f_final, total, tables), sees, torch.nan)
+        total = total + mask_rows(call(layer.f_mid[hop], summed, tables), held)
+    output = mask_rows(call(layer.f_final, total, tables), sees, torch.nan)
     return output, torch.stack(_of_one_width(sent)) if sent else data.new_zeros(0, data.shape[-1])
 
 
@@ -276,7 +276,7 @@ def own_data(policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tens
     return found
 
 
-def no_messages(policy: ModGNN, observation: Tensor, own: Tables, links: LinkData) -> Tensor:
+def no_messages(policy: ModGNN, observation: Tensor, own: NodeFeatures, links: LinkData) -> Tensor:
     """The messages of an agent that holds nothing, NaN [K, D]; their width is found by a step without neighbours.
 
     Raises:

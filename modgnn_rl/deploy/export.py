@@ -63,8 +63,8 @@ def export_agent(
 ) -> Exported:
     """Export what one agent computes in a step, `modgnn_rl.deploy.agent.step`, for any number of neighbours.
 
-    Nothing is written unless the files compute what the policy does, to `TOLERANCE`, on a short random flight with 0 to
-    40 neighbours. `modgnn_rl.deploy.onnx_agent.OnnxAgent` flies them.
+    Nothing is written unless the files compute what the policy does, to `TOLERANCE`, on a short random rollout with 0
+    to 40 neighbours. `modgnn_rl.deploy.onnx_agent.OnnxAgent` flies them.
 
     Args:
         policy: see `modgnn_rl.deploy.agent.check_local`; a copy in evaluation mode is exported.
@@ -193,7 +193,7 @@ def _trace(module: _Step, inputs: Inputs) -> tuple[torch.export.ExportedProgram,
 def _largest_difference(
     module: _Step, program: torch.export.ExportedProgram, onnx_model: bytes, inputs: Inputs
 ) -> float:
-    """Largest relative difference of both exports from the policy, on a random flight; infinite where NaN differ."""
+    """Largest relative difference of both exports from the policy, on a random rollout; infinite where NaN differ."""
     from modgnn_rl.deploy.onnx_agent import open_session
 
     try:

@@ -1,4 +1,4 @@
-"""How well policies fly: flights from the same starts, measured, beside the expert's and those of doing nothing."""
+"""How well policies fly: rollouts from the same starts, measured, beside the expert's and those of doing nothing."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
 from modgnn_rl.envs.flocking.metrics import (
     action_error,
     cohesion,
+    collision_rate,
     is_diverged,
-    is_lost,
     leader_distance,
-    near_collisions,
+    leader_lost,
+    min_distance,
     separation,
-    smallest_distance,
 )
 from modgnn_rl.utils.progress import Progress
 
-__all__ = ["Flights", "endless_env", "evaluate", "fly", "reference_policies"]
+__all__ = ["EpisodeMetrics", "evaluate", "make_eval_env", "reference_policies", "rollout"]
 
 QUARTERS = 4
 FRAME = 10  # cohesion, the only costly metric, is taken at each tenth step
 
 
 @dataclasses.dataclass
-class Flights:
-    """What was measured on flights, one entry a flock [F], averaged over its steps (and agents).
+class EpisodeMetrics:
+    """What was measured on rollouts, one entry a flock [F], averaged over its steps (and agents).
 
     Attributes:
         error: mean squared error of the action against the expert's, per component, m^2/s^2, over controlled agents.
-        error_by_quarter: the same in the four quarters of the flight [F, 4].
+        error_by_quarter: the same in the four quarters of the rollout [F, 4].
         leader_distance: distance of the leader from the centre of mass of the others, m.
         cohesion: diameter of the smallest enclosing sphere, m.
         separation: distance to the nearest neighbour, m.
         squares: means of the squares of the last three, for standard deviations over time, agents and flocks.
-        smallest_distance: smallest distance of two agents at any step, m.
-        near_collisions: mean number of touching pairs.
-        reward: reward of an agent, summed over the flight.
+        min_distance: smallest distance of two agents at any step, m.
+        collision_rate: mean number of touching pairs.
+        reward: reward of an agent, summed over the rollout.
         lost: nobody is within range of the leader at the end, bool.
         diverged: an agent was farther than ``max_distance`` from the centre of mass at some step, bool.
     """
@@ -58,8 +58,8 @@ class Flights:
     cohesion: Tensor
     separation: Tensor
     squares: dict[str, Tensor]
-    smallest_distance: Tensor
-    near_collisions: Tensor
+    min_distance: Tensor
+    collision_rate: Tensor
     reward: Tensor
     lost: Tensor
     diverged: Tensor
@@ -93,7 +93,7 @@ def _zero_action(observation: Tensor) -> Tensor:
     return torch.zeros_like(observation[..., :3])
 
 
-def endless_env(
+def make_eval_env(
     policy: TensorDictModuleBase,
     config: FlockingConfig,
     num_flocks: int,
@@ -104,14 +104,14 @@ def endless_env(
     device: torch.device | str = "cpu",
 ) -> TransformedEnv:
     """A world in which every flock flies ``steps`` steps, whatever happens to it, with the policy's recurrent state."""
-    world = dataclasses.replace(config, max_distance=torch.inf, max_colliding=1.0, max_steps=steps)
-    base = FlockingEnv(num_flocks, num_agents, config=world, seed=seed, device=device)
+    env_config = dataclasses.replace(config, max_distance=torch.inf, max_colliding=1.0, max_steps=steps)
+    base = FlockingEnv(num_flocks, num_agents, config=env_config, seed=seed, device=device)
     primers = get_primers_from_module(policy, warn=False)
     return TransformedEnv(base, Compose(InitTracker(), *([primers] if primers is not None else [])))
 
 
 @torch.no_grad()
-def fly(
+def rollout(
     policy: TensorDictModuleBase,
     config: FlockingConfig,
     *,
@@ -123,10 +123,10 @@ def fly(
     progress: Progress | None = None,
     expert: TensorDictModuleBase | None = None,
     watch: Callable[[TensorDictBase], None] | None = None,
-) -> Flights:
+) -> EpisodeMetrics:
     """Fly fresh flocks with a policy to the end of the episode and measure them.
 
-    Every flock is flown for all steps, also a diverged one, so that none drops out of the averages. Flights with equal
+    Every flock is flown for all steps, also a diverged one, so that none drops out of the averages. Rollouts with equal
     seeds have the same starts and the same leaders, whatever the policy.
 
     Args:
@@ -134,7 +134,7 @@ def fly(
         config: the world.
         num_agents: agents in a flock, N.
         num_flocks: flocks, F.
-        steps: steps of a flight.
+        steps: steps of a rollout.
         seed: seed of starts and leaders.
         device: where to fly.
         progress: counts flock-steps.
@@ -142,7 +142,7 @@ def fly(
         watch: is shown the flocks before each step, with both actions; see
             `modgnn_rl.envs.flocking.recording.Recorder`.
     """
-    env = endless_env(policy, config, num_flocks, num_agents, steps=steps, seed=seed, device=device)
+    env = make_eval_env(policy, config, num_flocks, num_agents, steps=steps, seed=seed, device=device)
     expert = expert or Reynolds.for_env(config)
     means = _Means(num_flocks, device)
     quarters = torch.zeros(num_flocks, QUARTERS, device=device)
@@ -161,10 +161,10 @@ def fly(
             means.add("error", error)
             means.add("leader_distance", leader_distance(position))
             means.add("separation", separation(position))
-            means.add("near_collisions", near_collisions(position, config.collision_distance))
+            means.add("collision_rate", collision_rate(position, config.collision_distance))
             if step % FRAME == 0:
                 means.add("cohesion", cohesion(position))
-            closest = torch.minimum(closest, smallest_distance(position))
+            closest = torch.minimum(closest, min_distance(position))
             diverged |= is_diverged(position, config.max_distance)
             tensordict = env.step(tensordict)
             means.add("reward", tensordict["next", "agents", "reward"].squeeze(-1))
@@ -172,7 +172,7 @@ def fly(
             if progress is not None:
                 progress.update(num_flocks)
     counts = torch.bincount(torch.arange(steps) * QUARTERS // steps, minlength=QUARTERS).to(device)
-    return Flights(
+    return EpisodeMetrics(
         error=means["error"],
         error_by_quarter=quarters / counts,
         leader_distance=means["leader_distance"],
@@ -181,10 +181,10 @@ def fly(
         squares={
             name: means.squares[name] / means.count[name] for name in ("leader_distance", "cohesion", "separation")
         },
-        smallest_distance=closest,
-        near_collisions=means["near_collisions"],
+        min_distance=closest,
+        collision_rate=means["collision_rate"],
         reward=means["reward"] * steps,
-        lost=is_lost(tensordict[config.state_key][..., :3], config.comm_range),
+        lost=leader_lost(tensordict[config.state_key][..., :3], config.comm_range),
         diverged=diverged,
     )
 
@@ -220,19 +220,19 @@ def evaluate(
     device: torch.device | str = "cpu",
     expert: TensorDictModuleBase | None = None,
     watches: Mapping[str, Callable[[TensorDictBase], None]] | None = None,
-) -> dict[str, Flights]:
-    """Fly each policy, and the reference policies, from the same starts; progress is shown. See `fly`.
+) -> dict[str, EpisodeMetrics]:
+    """Fly each policy, and the reference policies, from the same starts; progress is shown. See `rollout`.
 
     With an expert of one's own, the reference is it and doing nothing. ``watches``, by name of the policy, are shown
-    its flights.
+    its rollouts.
     """
     policies = {**policies, **reference_policies(config, expert)}
     total = len(policies) * num_flocks * steps
-    flights = {}
+    rollouts = {}
     with Progress(f"evaluate, {num_agents} agents", total) as progress:
         for name, policy in policies.items():
             progress.update(flying=name)
-            flights[name] = fly(
+            rollouts[name] = rollout(
                 policy,
                 config,
                 num_agents=num_agents,
@@ -244,4 +244,4 @@ def evaluate(
                 expert=expert,
                 watch=(watches or {}).get(name),
             )
-    return flights
+    return rollouts

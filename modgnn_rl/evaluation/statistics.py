@@ -125,13 +125,13 @@ class Interval:
 def interquartile_interval(
     values: ArrayLike, *, rng: np.random.Generator, confidence: float = 0.95, resamples: int = 2000
 ) -> Interval:
-    """Interquartile mean over seeds and flights, and its stratified bootstrap interval (Agarwal et al. 2021).
+    """Interquartile mean over seeds and rollouts, and its stratified bootstrap interval (Agarwal et al. 2021).
 
-    A resample draws seeds with replacement, and then, within each seed drawn, flights with replacement. With one seed
-    the interval tells of flights only.
+    A resample draws seeds with replacement, and then, within each seed drawn, rollouts with replacement. With one seed
+    the interval tells of rollouts only.
 
     Args:
-        values: ``[S, F]``, of each seed its flights; infinite values are allowed, they count as the worst.
+        values: ``[S, F]``, of each seed its rollouts; infinite values are allowed, they count as the worst.
         rng: source of the resampling.
         confidence: coverage of the interval, above 0 and below 1.
         resamples: bootstrap samples, at least 1.
@@ -141,8 +141,8 @@ def interquartile_interval(
     """
     data = _checked_matrix(values)
     lot = _Lot(rng, resamples, confidence)
-    seeds, flights = data.shape
-    drawn = data[lot.draw(seeds, (seeds, 1)), lot.draw(flights, data.shape)].reshape(resamples, -1)
+    seeds, rollouts = data.shape
+    drawn = data[lot.draw(seeds, (seeds, 1)), lot.draw(rollouts, data.shape)].reshape(resamples, -1)
     return lot.interval(float(_middle_mean(data.reshape(1, -1))[0]), _middle_mean(drawn))
 
 
@@ -157,23 +157,24 @@ def probability_of_improvement(
 ) -> Interval:
     """Probability that one policy has a lower value than another: ``P(X < Y) + P(X = Y) / 2`` (Agarwal et al. 2021).
 
-    The flights are Agarwal's tasks, the seeds the runs: where both flew the same flights, each flight is compared with
-    itself, for all pairs of seeds. The interval is that of a bootstrap over the seeds of each and over the flights.
+    The rollouts are Agarwal's tasks, the seeds the runs: where both flew the same rollouts, each rollout is compared
+    with itself, for all pairs of seeds. The interval is that of a bootstrap over the seeds of each and over the
+    rollouts.
 
     Args:
-        better: ``[S, F]``, of each seed of the one its flights; lower is better.
+        better: ``[S, F]``, of each seed of the one its rollouts; lower is better.
         worse: ``[T, G]``, the same of the other.
         rng: source of the resampling.
-        paired: flight f of the one began like flight f of the other (F = G); else every flight meets every other.
+        paired: rollout f of the one began like rollout f of the other (F = G); else every rollout meets every other.
         confidence: coverage of the interval, above 0 and below 1.
         resamples: bootstrap samples, at least 1.
 
     Raises:
-        InputError: no values, a NaN, a setting out of range, or different flights where they should be paired.
+        InputError: no values, a NaN, a setting out of range, or different rollouts where they should be paired.
     """
     x, y = _checked_matrix(better), _checked_matrix(worse)
     if paired and x.shape[1] != y.shape[1]:
-        raise InputError(f"{x.shape[1]} and {y.shape[1]} flights cannot be paired; give values of the same flights")
+        raise InputError(f"{x.shape[1]} and {y.shape[1]} rollouts cannot be paired; give values of the same rollouts")
     if paired:
         a, b, axes = x[:, None], y[None], "stf,rs,rt,rf->r"
     else:
@@ -225,9 +226,9 @@ def _checked_matrix(values: ArrayLike) -> NDArray[np.float64]:
     """Return the values as float64 [S, F], or raise InputError."""
     data = np.asarray(values, dtype=np.float64)
     if data.ndim != 2 or data.size == 0:
-        raise InputError(f"values have shape {data.shape}; expected one row a seed and one column a flight")
+        raise InputError(f"values have shape {data.shape}; expected one row a seed and one column a rollout")
     if bad := int(np.isnan(data).sum()):
-        raise InputError(f"{bad} of {data.size} values are no numbers; count those flights as infinite, or say so")
+        raise InputError(f"{bad} of {data.size} values are no numbers; count those rollouts as infinite, or say so")
     return data
 
 

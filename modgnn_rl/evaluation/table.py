@@ -1,4 +1,4 @@
-"""The evaluation table: figures of flights with their spread and confidence, as JSON and as Markdown."""
+"""The evaluation table: figures of rollouts with their spread and confidence, as JSON and as Markdown."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from typing import Any
 import numpy as np
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation.rollout import Flights
+from modgnn_rl.evaluation.rollout import EpisodeMetrics
 from modgnn_rl.evaluation.statistics import paired_difference, summarise
 from modgnn_rl.utils.text import markdown
 
-__all__ = ["as_markdown", "read_tables", "summarise_flights"]
+__all__ = ["as_markdown", "read_tables", "summarise_rollouts"]
 
 YARDSTICK = "LocalReynolds(hops=1)"
-SUMMARISED = ("error", "leader_distance", "cohesion", "separation", "smallest_distance", "near_collisions", "reward")
+SUMMARISED = ("error", "leader_distance", "cohesion", "separation", "min_distance", "collision_rate", "reward")
 ERROR_HEADER = ("flown by", "error", "median", "by quarter", "lost", "diverged")
 SHAPE_HEADER = ("flown by", "leader distance", "cohesion", "separation", "smallest", "touching", "reward")
 NOTE = """\
 All rows fly from the same starts behind the same leaders, each to the end. Mean ± standard deviation over flocks
 [95 % confidence interval of the mean]. Error: mean squared error of the action against the expert's, per component,
-over the agents that the policy flies, m^2/s^2; with its median over flocks and its mean in the quarters of the flight.
+over the agents that the policy flies, m^2/s^2; with its median over flocks and its mean in the quarters of the rollout.
 Lost: share of flocks in which nobody hears the leader at the end. Diverged: share of flocks in which an agent strayed
 beyond env.max_distance. Leader distance: from the leader to the centre of mass of the others. Cohesion: diameter of the
 smallest enclosing sphere. Separation: distance to the nearest neighbour. Smallest: the smallest distance of any two
-agents in any flight. Touching: pairs within env.collision_distance, mean over time. Reward: of an agent, summed over
-the flight. All distances in m."""
+agents in any rollout. Touching: pairs within env.collision_distance, mean over time. Reward: of an agent, summed over
+the rollout. All distances in m."""
 
 
-def summarise_flights(flights: Mapping[str, Flights], seed: int) -> dict[str, Any]:
-    """Summarise each row's flights over flocks.
+def summarise_rollouts(rollouts: Mapping[str, EpisodeMetrics], seed: int) -> dict[str, Any]:
+    """Summarise each row's rollouts over flocks.
 
     Args:
-        flights: flights by name of the policy, all from the same starts.
+        rollouts: rollouts by name of the policy, all from the same starts.
         seed: seed of the bootstrap.
 
     Returns:
@@ -46,21 +46,21 @@ def summarise_flights(flights: Mapping[str, Flights], seed: int) -> dict[str, An
     """
     rng = np.random.default_rng(seed)
     table: dict[str, Any] = {}
-    for name, flight in flights.items():
+    for name, rollout in rollouts.items():
         row: dict[str, Any] = {}
         for metric in SUMMARISED:
-            values = getattr(flight, metric).double().cpu().numpy()
+            values = getattr(rollout, metric).double().cpu().numpy()
             # A flock of one has nobody that the policy flies, and no neighbour.
             row[metric] = dataclasses.asdict(summarise(values, rng=rng)) if np.isfinite(values).all() else None
-        for metric, squares in flight.squares.items():
+        for metric, squares in rollout.squares.items():
             if row[metric] is not None:
-                row[metric]["std_over_time"] = float((squares.mean() - getattr(flight, metric).mean() ** 2).sqrt())
-        row["error_by_quarter"] = flight.error_by_quarter.mean(0).tolist()
-        row["smallest_distance_ever"] = float(flight.smallest_distance.min())
-        row["lost"] = float(flight.lost.double().mean())
-        row["diverged"] = float(flight.diverged.double().mean())
-        if YARDSTICK in flights and name != YARDSTICK:
-            mine, local = (f.error.double().cpu().numpy() for f in (flight, flights[YARDSTICK]))
+                row[metric]["std_over_time"] = float((squares.mean() - getattr(rollout, metric).mean() ** 2).sqrt())
+        row["error_by_quarter"] = rollout.error_by_quarter.mean(0).tolist()
+        row["smallest_distance_ever"] = float(rollout.min_distance.min())
+        row["lost"] = float(rollout.lost.double().mean())
+        row["diverged"] = float(rollout.diverged.double().mean())
+        if YARDSTICK in rollouts and name != YARDSTICK:
+            mine, local = (f.error.double().cpu().numpy() for f in (rollout, rollouts[YARDSTICK]))
             if row["error"] is not None:
                 row["error_minus_local"] = dataclasses.asdict(paired_difference(mine, local, rng=rng))
         table[name] = row
@@ -84,8 +84,8 @@ def as_markdown(tables: Mapping[str, Any], title: str) -> str:
     """Tables, by number of agents, as a Markdown page that also reads well on a terminal.
 
     Args:
-        tables: for each number of agents the flights it was made of (``num_flocks``, ``steps``) and its ``rows``, as
-            made by `summarise_flights`.
+        tables: for each number of agents the rollouts it was made of (``num_flocks``, ``steps``) and its ``rows``, as
+            made by `summarise_rollouts`.
         title: heading of the page.
     """
     parts = [f"# {title}"]
@@ -94,7 +94,7 @@ def as_markdown(tables: Mapping[str, Any], title: str) -> str:
         errors = [ERROR_HEADER, *([name, *_error_cells(row)] for name, row in rows.items())]
         shapes = [SHAPE_HEADER, *([name, *_shape_cells(row)] for name, row in rows.items())]
         parts += [
-            f"## {size} agents, {table['num_flocks']} flights of {table['steps']} steps",
+            f"## {size} agents, {table['num_flocks']} rollouts of {table['steps']} steps",
             markdown(errors),
             markdown(shapes),
         ]
@@ -111,9 +111,9 @@ def _error_cells(row: Mapping[str, Any]) -> list[str]:
 
 def _shape_cells(row: Mapping[str, Any]) -> list[str]:
     cells = [_spread(row[metric], 2) for metric in ("leader_distance", "cohesion", "separation")]
-    alone = row["smallest_distance"] is None
+    alone = row["min_distance"] is None
     smallest = "-" if alone else f"{row['smallest_distance_ever']:.2f}"
-    touching = "-" if row["near_collisions"] is None else f"{row['near_collisions']['mean']:.2g}"
+    touching = "-" if row["collision_rate"] is None else f"{row['collision_rate']['mean']:.2g}"
     return [*cells, smallest, touching, _interval(row["reward"], 1)]
 
 

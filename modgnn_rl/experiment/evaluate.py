@@ -13,9 +13,9 @@ from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingC
 from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.recording import Recorder, spacing
 from modgnn_rl.evaluation.rollout import evaluate
-from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_flights
+from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_rollouts
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.tracking.loading import changed_world, load_policy
+from modgnn_rl.tracking.loading import load_policy, override_env_config
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.visualization.html import write_replay
@@ -28,7 +28,7 @@ REPLAY_FRAMES = 250  # of the replay beside a table: keeping more would take lon
 def evaluate_policies(
     run: RunFolder,
     policies: Mapping[str, ModGNN],
-    world: FlockingConfig,
+    env_config: FlockingConfig,
     settings: EvaluationConfig,
     sizes: list[int],
     device: str,
@@ -41,15 +41,15 @@ def evaluate_policies(
     folder holds already are kept; a world changed since training has files of its own.
 
     Returns:
-        for each number of agents, the table that `modgnn_rl.evaluation.table.summarise_flights` makes.
+        for each number of agents, the table that `modgnn_rl.evaluation.table.summarise_rollouts` makes.
     """
     tables, replays = {}, {}
     for size in sizes:
-        every = spacing(size, settings.steps, REPLAY_FRAMES)
-        replays[size] = {name: Recorder(world, every) for name in (*policies, "expert")}
-        flights = evaluate(
+        stride = spacing(size, settings.steps, REPLAY_FRAMES)
+        replays[size] = {name: Recorder(env_config, stride) for name in (*policies, "expert")}
+        rollouts = evaluate(
             policies,
-            world,
+            env_config,
             num_agents=size,
             num_flocks=settings.num_flocks,
             steps=settings.steps,
@@ -58,7 +58,7 @@ def evaluate_policies(
             expert=expert,
             watches=replays[size],
         )
-        tables[size] = summarise_flights(flights, settings.seed)
+        tables[size] = summarise_rollouts(rollouts, settings.seed)
     flown = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
     new = {str(size): {**flown, "rows": table} for size, table in tables.items()}
     title = f"{run.path.name} in a world with {changes}" if changes else run.path.name
@@ -71,7 +71,7 @@ def evaluate_policies(
         page = file.with_name(file.stem.replace("evaluation", f"replay-{size}", 1) + ".html")
         recordings = {name: recorder.recording() for name, recorder in recorders.items()}
         write_replay(page, recordings, title, {"seed": settings.seed, "flock": f"1 of {settings.num_flocks}"})
-        print(f"A flight of {size} agents to watch in a browser: {page}", flush=True)
+        print(f"A rollout of {size} agents to watch in a browser: {page}", flush=True)
     return tables
 
 
@@ -98,9 +98,11 @@ def evaluate_run(config: EvaluateConfig) -> Path:
     prepare_torch(config.device, config.threads)
     policy = load_policy(config.run, device=config.device, which=config.checkpoint)
     run = RunFolder.open(config.run)
-    world, changes = changed_world(run, config.env)
-    sizes = as_list(config.evaluation.num_agents or world.num_agents)
+    env_config, changes = override_env_config(run, config.env)
+    sizes = as_list(config.evaluation.num_agents or env_config.num_agents)
     best = {"checkpoint": "best"} if config.checkpoint == "best" else {}
     named = ",".join(f"{name}={value}" for name, value in sorted({**changes, **best}.items()))
-    evaluate_policies(run, {run.config["model"]["name"]: policy}, world, config.evaluation, sizes, config.device, named)
+    evaluate_policies(
+        run, {run.config["model"]["name"]: policy}, env_config, config.evaluation, sizes, config.device, named
+    )
     return evaluation_file(run, named)

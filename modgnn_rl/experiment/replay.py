@@ -1,4 +1,4 @@
-"""From a run folder to a flight that can be looked at."""
+"""From a run folder to a rollout that can be looked at."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.recording import Recording, spacing
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import reference_policies
-from modgnn_rl.tracking.loading import changed_world, load_policy
+from modgnn_rl.tracking.loading import load_policy, override_env_config
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.utils.progress import Progress
@@ -35,28 +35,30 @@ def replay_run(config: ReplayConfig) -> Path:
     check(config)
     prepare_torch(config.device, config.threads)
     run = RunFolder.open(config.run)
-    world, changes = changed_world(run, config.env)
-    if config.num_agents is None and len(world.sizes) > 1:
-        raise InputError(f"the run was trained with {world.sizes} agents; choose one size: num_agents={world.sizes[0]}")
-    agents = config.num_agents or world.sizes[0]
+    env_config, changes = override_env_config(run, config.env)
+    if config.num_agents is None and len(env_config.sizes) > 1:
+        raise InputError(
+            f"the run was trained with {env_config.sizes} agents; choose one size: num_agents={env_config.sizes[0]}"
+        )
+    agents = config.num_agents or env_config.sizes[0]
     path = Path(config.output or run.path / f"replay.{config.format}").absolute()
-    policies = _policies(config, world)
+    policies = _policies(config, env_config)
     name, policy = next(iter(policies.items()))
-    flight: dict[str, Any] = {
+    rollout: dict[str, Any] = {
         "num_agents": agents, "steps": config.steps, "seed": config.seed, "device": config.device
     }  # fmt: skip
     try:
         if config.format == "mp4":
             from modgnn_rl.visualization.video import film, write_video
 
-            write_video(path, film(policy, world, **flight), world.control_frequency)
+            write_video(path, film(policy, env_config, **rollout), env_config.control_frequency)
             return path
-        every = config.every or spacing(agents, config.steps)
+        stride = config.stride or spacing(agents, config.steps)
         still = config.format in ("svg", "png")
         shown = config.steps - 1 if config.step is None else config.step
         if still:  # nothing after it is seen
-            every, flight["steps"] = 1, shown + 1
-        recordings = _fly_all(policies, world, every, config, flight)
+            stride, rollout["steps"] = 1, shown + 1
+        recordings = _fly_all(policies, env_config, stride, config, rollout)
         facts = {"run": run.path.name, "flown": f"{agents} agents, {config.steps} steps, seed {config.seed}"}
         facts |= {"checkpoint": config.checkpoint} | {f"env.{key}": value for key, value in changes.items()}
         if still:
@@ -70,7 +72,7 @@ def replay_run(config: ReplayConfig) -> Path:
     return path
 
 
-def _policies(config: ReplayConfig, world: FlockingConfig) -> dict[str, TensorDictModuleBase]:
+def _policies(config: ReplayConfig, env_config: FlockingConfig) -> dict[str, TensorDictModuleBase]:
     """Who flies, by name: the run's policy first, then the expert, then others."""
     folders = [config.run, *as_list(config.others or [])]
     policies: dict[str, TensorDictModuleBase] = {}
@@ -81,22 +83,22 @@ def _policies(config: ReplayConfig, world: FlockingConfig) -> dict[str, TensorDi
             name = f"{name}, {run.path.name}"
         policies[name] = load_policy(folder, device=config.device, which=config.checkpoint)
         if config.with_expert and len(policies) == 1:
-            policies["expert"] = reference_policies(world)["expert"]
+            policies["expert"] = reference_policies(env_config)["expert"]
     return policies
 
 
 def _fly_all(
     policies: dict[str, TensorDictModuleBase],
-    world: FlockingConfig,
-    every: int,
+    env_config: FlockingConfig,
+    stride: int,
     config: ReplayConfig,
-    flight: dict[str, Any],
+    rollout: dict[str, Any],
 ) -> dict[str, Recording]:
-    """Record everybody's flight; the first one is shown while it is flown, where that is asked for."""
+    """Record everybody's rollout; the first one is shown while it is flown, where that is asked for."""
     recordings: dict[str, Recording] = {}
     with (
         contextlib.ExitStack() as stack,
-        Progress("replay", len(policies) * flight["steps"]) as progress,
+        Progress("replay", len(policies) * rollout["steps"]) as progress,
     ):
         for name, policy in policies.items():
             progress.update(flying=name)
@@ -104,6 +106,6 @@ def _fly_all(
             if config.viewer and not recordings:
                 from modgnn_rl.visualization.viewer import Viewer
 
-                viewer = stack.enter_context(Viewer(world, config.port))
-            recordings[name] = record(policy, world, every=every, progress=progress, watch=viewer, **flight)
+                viewer = stack.enter_context(Viewer(env_config, config.port))
+            recordings[name] = record(policy, env_config, stride=stride, progress=progress, watch=viewer, **rollout)
     return recordings

@@ -15,7 +15,14 @@ from modgnn_rl.configs.settings import flat
 from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.run_folder import RunFolder
 
-__all__ = ["TRAINER_SETTINGS", "begins_anew", "changed_config", "differences", "stored_config", "with_stored_trainer"]
+__all__ = [
+    "TRAINER_SETTINGS",
+    "changed_config",
+    "differences",
+    "requires_restart",
+    "stored_config",
+    "with_stored_trainer",
+]
 
 TRAINER_SETTINGS: dict[str, type] = {"bc": BCConfig, "dagger": DAggerConfig, "mappo": MAPPOConfig}
 
@@ -34,15 +41,15 @@ FIXED = (
     "runs",
     "name",
 )
-# What flights and data were made for: with another of these, flocks begin anew, with no data.
+# What rollouts and data were made for: with another of these, flocks begin anew, with no data.
 FLOWN = (
     "env",
     "device",
     "collector",
     "trainer.num_envs",
-    "trainer.held_out",
+    "trainer.num_val_envs",
     "trainer.capacity",
-    "trainer.every",
+    "trainer.stride",
     "trainer.replacement",
     "trainer.hide_velocity",
 )
@@ -104,7 +111,7 @@ def differences(old: TrainConfig, new: TrainConfig) -> dict[str, tuple[Any, Any]
     return found
 
 
-def begins_anew(changed: Mapping[str, tuple[Any, Any]]) -> list[str]:
+def requires_restart(changed: Mapping[str, tuple[Any, Any]]) -> list[str]:
     """Those of the changed settings with which flocks begin anew, as ``name=value``."""
     return [
         f"{key}={value}"

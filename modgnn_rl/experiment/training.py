@@ -17,20 +17,20 @@ from modgnn_rl.configs.schema import TrainConfig, as_list
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError, one_line
 from modgnn_rl.experiment.evaluate import evaluate_policies
-from modgnn_rl.experiment.resume import begins_anew, changed_config, differences, stored_config
+from modgnn_rl.experiment.resume import changed_config, differences, requires_restart, stored_config
 from modgnn_rl.tracking.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
-from modgnn_rl.tracking.loggers import Dashboards, check_logger, make_logger
+from modgnn_rl.tracking.loggers import LoggerGroup, check_logger, make_logger
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.bc import bc
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.dagger import dagger
 from modgnn_rl.trainers.loop.callbacks import Callback
-from modgnn_rl.trainers.loop.context import Session
-from modgnn_rl.trainers.loop.dashboard_callback import Watch, log_evaluation
-from modgnn_rl.trainers.loop.setup import check_training, settle_model
+from modgnn_rl.trainers.loop.context import TrainContext
+from modgnn_rl.trainers.loop.dashboard_callback import DashboardCallback, log_evaluation
+from modgnn_rl.trainers.loop.setup import check_training, resolve_model
 from modgnn_rl.trainers.mappo import mappo
 from modgnn_rl.utils.device import prepare_torch
-from modgnn_rl.utils.signals import Interruption
+from modgnn_rl.utils.signals import GracefulInterrupt
 
 __all__ = ["TRAINERS", "resume", "train"]
 
@@ -56,10 +56,10 @@ def train(
         InputError: a bad setting, or a device or a logger that this machine does not have; nothing is created then.
     """
     config = _checked(config, expert)
-    with distributed.joined(config.device):
+    with distributed.process_group(config.device):
         run = _new_run(config)
         with _lock(run):
-            distributed.say(f"Training in {run.path}")
+            distributed.print_rank0(f"Training in {run.path}")
             return _work(config, run, expert, callbacks)
 
 
@@ -91,17 +91,19 @@ def resume(
     config = changed_config(old, changes or {})
     changed = differences(old, config)
     config = _checked(config, expert)
-    with distributed.joined(config.device), _lock(run):
+    with distributed.process_group(config.device), _lock(run):
         checkpoint = load_checkpoint(run.checkpoints) if has_checkpoint(run.checkpoints) else None
-        anew = begins_anew(changed)
+        anew = requires_restart(changed)
         if changed and distributed.is_first():
             run = run.with_config(OmegaConf.to_yaml(OmegaConf.structured(config)))
         where = "its start, for it has no checkpoint yet" if checkpoint is None else f"round {checkpoint.step}"
-        distributed.say(f"Resuming {run.path} from {where}")
+        distributed.print_rank0(f"Resuming {run.path} from {where}")
         if anew and checkpoint is not None:
-            distributed.say(f"Flocks begin anew, with no data, because of {', '.join(anew)}")
+            distributed.print_rank0(f"Flocks begin anew, with no data, because of {', '.join(anew)}")
         elif distributed.size() > 1 and checkpoint is not None:
-            distributed.say("Flocks begin anew, with no data, in all processes but the first, whose flocks are kept")
+            distributed.print_rank0(
+                "Flocks begin anew, with no data, in all processes but the first, whose flocks are kept"
+            )
         return _work(config, run, expert, callbacks, checkpoint, keeps_flocks=not anew)
 
 
@@ -110,7 +112,7 @@ def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainC
     check(config)
     prepare_torch(distributed.own_device(config.device), config.threads)
     check_logger(config)
-    config = settle_model(config)
+    config = resolve_model(config)
     check_training(config)
     if expert is not None and getattr(config.trainer, "dataset", None):
         raise InputError(
@@ -145,29 +147,31 @@ def _work(
 ) -> RunFolder:
     """Train from the beginning or from a checkpoint, then evaluate, which the first process does alone."""
     first = distributed.is_first()
-    dashboards = make_logger(config, run) if first else Dashboards({})
-    watches = [Watch(config, run, dashboards, expert)] if dashboards else []
-    with Interruption().listen() as interruption:
+    loggers = make_logger(config, run) if first else LoggerGroup({})
+    watches = [DashboardCallback(config, run, loggers, expert)] if loggers else []
+    with GracefulInterrupt().listen() as interruption:
         own = distributed.own_part(config, checkpoint.step if checkpoint else 0)
         keeps_flocks = keeps_flocks and first
-        session = Session(own, run, dashboards, expert, [*callbacks, *watches], checkpoint, keeps_flocks, interruption)
+        context = TrainContext(
+            own, run, loggers, expert, [*callbacks, *watches], checkpoint, keeps_flocks, interruption
+        )
         try:
-            policies = TRAINERS[config.trainer.name](session)
+            policies = TRAINERS[config.trainer.name](context)
             distributed.leave()
             if not first:
                 return run
             run.note_status("evaluating")
             sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
-            world, settings, device = config.env, config.evaluation, own.device
-            tables = evaluate_policies(run, policies, world, settings, sizes, device, expert=expert)
-            log_evaluation(dashboards, tables)
+            env_config, settings, device = config.env, config.evaluation, own.device
+            tables = evaluate_policies(run, policies, env_config, settings, sizes, device, expert=expert)
+            log_evaluation(loggers, tables)
             run.note_status("finished")
         except BaseException as error:
             if first:
                 _note_end(run, error)
             raise
         finally:
-            for where in dashboards.close():
+            for where in loggers.close():
                 print(where)
     return run
 

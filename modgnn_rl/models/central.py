@@ -6,10 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.nn.aggregation import Tables
+from modgnn_rl.nn.aggregation import NodeFeatures
 from modgnn_rl.nn.layer import Recorder, only_finite
 from modgnn_rl.nn.topology import Topology
-from modgnn_rl.utils.tensors import keep_rows
+from modgnn_rl.utils.tensors import mask_rows
 
 __all__ = ["CentralLayer"]
 
@@ -53,7 +53,7 @@ class CentralLayer(nn.Module):
         adjacency: Tensor | Topology,
         is_init: Tensor | None = None,
         messages: Tensor | None = None,
-        own: Tables | None = None,
+        own: NodeFeatures | None = None,
         *,
         receivers: Tensor | None = None,
         record: Recorder | None = None,
@@ -75,15 +75,15 @@ class CentralLayer(nn.Module):
         topology = adjacency if isinstance(adjacency, Topology) else Topology(adjacency, shape[-1], receivers=receivers)
         seen, _, sees = only_finite(observation.reshape(shape.numel(), -1), {})
         there = sees if topology.exists is None else sees & topology.exists
-        flocks = keep_rows(seen, there).unflatten(0, (-1, self.num_agents))
+        flocks = mask_rows(seen, there).unflatten(0, (-1, self.num_agents))
         counts = there.view(-1, self.num_agents, 1).sum(1, keepdim=True).clamp(min=1)
         mean = flocks[..., :3].sum(1, keepdim=True) / counts
         centred = torch.cat((flocks[..., :3] - mean, flocks[..., 3:]), -1).flatten(0, 1)
-        inputs = keep_rows(self.scale(centred), there).view(-1, self.num_agents * centred.shape[-1])
+        inputs = mask_rows(self.scale(centred), there).view(-1, self.num_agents * centred.shape[-1])
         output = self.head(self.network(inputs).view(shape.numel(), self.outputs))
-        output = keep_rows(output, sees, torch.nan)
+        output = mask_rows(output, sees, torch.nan)
         if topology.wanted_nodes is not None:
-            output = keep_rows(output, topology.wanted_nodes)
+            output = mask_rows(output, topology.wanted_nodes)
         if record is not None and record.wants("f_final"):
             record.nodes("f_final", None, output)
         return output.unflatten(0, shape), seen.new_zeros(*shape, 0, seen.shape[-1])

@@ -128,25 +128,27 @@ def make_model(
         return ModGNN(built, **keys)
 
 
-def configured_model(model: ModelConfig, world: FlockingConfig, seed: int) -> ModGNN:
+def configured_model(model: ModelConfig, env_config: FlockingConfig, seed: int) -> ModGNN:
     """The policy that a configuration asks for.
 
     Args:
         model: which one.
-        world: the world that it is trained in: its action ball, and for ``central`` its number of agents.
+        env_config: the world that it is trained in: its action ball, and for ``central`` its number of agents.
         seed: seed of the initial weights.
 
     Raises:
         InputError: a model that cannot serve that world.
     """
-    if model.name == "central" and len(world.sizes) > 1:
-        raise InputError(f"model 'central' serves one number of agents, and env.num_agents={world.sizes} asks for more")
+    if model.name == "central" and len(env_config.sizes) > 1:
+        raise InputError(
+            f"model 'central' serves one number of agents, and env.num_agents={env_config.sizes} asks for more"
+        )
     return make_model(
         model.name,
         model.hops,
         model.hidden,
         layers=model.layers,
-        max_speed=world.max_speed,
-        num_agents=world.sizes[0],
+        max_speed=env_config.max_speed,
+        num_agents=env_config.sizes[0],
         seed=seed,
     )

@@ -6,7 +6,8 @@
   layers before the first ReLU act on nodes instead of links, those after the last ReLU on the sum;
 - *blocks of links* that stay in the processor's cache, and are computed again in the backward pass instead of being
   stored where there are many; any f_com and f_pre;
-- *all at once*, where blocks would not be exact (batch statistics, values of links asked for) or possible (`Pairs`).
+- *all at once*, where blocks would not be exact (batch statistics, values of links asked for) or possible
+(`DenseGraph`).
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from torch.nn.modules.batchnorm import _NormBase
 
 from modgnn_rl.nn import fused
 from modgnn_rl.nn.communication import Communication
-from modgnn_rl.nn.graph import Graph, Links
+from modgnn_rl.nn.graph import EdgeList, Graph
 from modgnn_rl.utils.tensors import is_transformed
 
 __all__ = ["Hop", "aggregate", "call", "suited_form"]
 
 STORED_LINKS = 1 << 16  # up to this many links, the backward pass finds all activations stored
 
-Tables = Mapping[tuple[str, ...], Tensor]
+NodeFeatures = Mapping[tuple[str, ...], Tensor]
 
 
 class Hop(NamedTuple):
@@ -45,17 +46,17 @@ class Hop(NamedTuple):
 
     senders: Tensor
     receivers: Tensor
-    own: Tables
+    own: NodeFeatures
 
 
-def call(module: nn.Module, data: Tensor, own: Tables, links: Graph | None = None) -> Tensor:
+def call(module: nn.Module, data: Tensor, own: NodeFeatures, links: Graph | None = None) -> Tensor:
     """Apply a plain or a keyed submodule to rows of data [E, D]; ``own`` [E, ...] and ``links`` are for keyed ones."""
     if not isinstance(module, TensorDictModuleBase):
         return module(data)
     return _call_keyed(module, {("data",): data, **own}, links)
 
 
-def _call_keyed(module: TensorDictModuleBase, entries: Tables, links: Graph | None) -> Tensor:
+def _call_keyed(module: TensorDictModuleBase, entries: NodeFeatures, links: Graph | None) -> Tensor:
     rows = TensorDict({}, next(iter(entries.values())).shape[:1])
     for key, value in entries.items():
         rows[key] = value
@@ -66,7 +67,7 @@ def _call_keyed(module: TensorDictModuleBase, entries: Tables, links: Graph | No
     return module(rows)[module.out_keys[-1]]
 
 
-def communicate(f_com: nn.Module, sender: Tensor, receiver: Tensor, own: Tables, links: Graph) -> Tensor:
+def communicate(f_com: nn.Module, sender: Tensor, receiver: Tensor, own: NodeFeatures, links: Graph) -> Tensor:
     """Y of the links [E, D'], with whichever signature f_com has."""
     if isinstance(f_com, Communication):
         return f_com(sender, receiver, links)
@@ -96,9 +97,9 @@ def aggregate(
     Returns:
         one row a receiver [R, F]; zero where it receives on no link.
     """
-    if record is not None or not isinstance(graph, Links) or _has_batch_statistics(f_com, f_pre):
-        own = {key: graph.at_receivers(value) for key, value in hop.own.items()}
-        rows = graph.at_senders(hop.senders), graph.at_receivers(hop.receivers)
+    if record is not None or not isinstance(graph, EdgeList) or _has_batch_statistics(f_com, f_pre):
+        own = {key: graph.gather_receivers(value) for key, value in hop.own.items()}
+        rows = graph.gather_senders(hop.senders), graph.gather_receivers(hop.receivers)
         return graph.aggregate(_values(f_com, f_pre, graph, *rows, own, record), aggregation)
     rewritten = fused.rewrite(graph, f_com, f_pre) if aggregation in ("sum", "mean") else None
     if rewritten is not None:
@@ -117,7 +118,7 @@ def _values(
     links: Graph,
     sender: Tensor,
     receiver: Tensor,
-    own: Tables,
+    own: NodeFeatures,
     record: Callable[[str, Tensor], None] | None = None,
 ) -> Tensor:
     """``f_pre(f_com(m_j, m_i))`` of links [E, F]."""
@@ -137,7 +138,7 @@ class _OfLinks(nn.Module):
         super().__init__()
         self.f_com, self.f_pre = f_com, f_pre
 
-    def forward(self, links: Graph, sender: Tensor, receiver: Tensor, own: Tables) -> Tensor:
+    def forward(self, links: Graph, sender: Tensor, receiver: Tensor, own: NodeFeatures) -> Tensor:
         return _values(self.f_com, self.f_pre, links, sender, receiver, own)
 
     def weights(self) -> dict[str, Tensor]:
@@ -153,15 +154,15 @@ class _OfLinks(nn.Module):
 
 
 def _in_blocks(
-    values: _OfLinks, graph: Links, aggregation: str, keys: tuple[tuple[str, ...], ...], tables: Iterable[Tensor]
+    values: _OfLinks, graph: EdgeList, aggregation: str, keys: tuple[tuple[str, ...], ...], tables: Iterable[Tensor]
 ) -> Tensor:
     """Aggregate block by block; whole neighbourhoods lie in one block."""
     senders, *of_receivers = tables
     results = []
     for receivers, links in graph.blocks():
         block = graph.block(receivers, links)
-        receiver, *own = (block.at_receivers(table[receivers]) for table in of_receivers)
-        result = values(block, block.at_senders(senders), receiver, dict(zip(keys, own, strict=True)))
+        receiver, *own = (block.gather_receivers(table[receivers]) for table in of_receivers)
+        result = values(block, block.gather_senders(senders), receiver, dict(zip(keys, own, strict=True)))
         results.append(block.aggregate(result, aggregation))
     return results[0] if len(results) == 1 else torch.cat(results)
 
@@ -177,7 +178,7 @@ class _Recomputed(torch.autograd.Function):
     def forward(
         ctx: Any,
         values: _OfLinks,
-        graph: Links,
+        graph: EdgeList,
         aggregation: str,
         keys: tuple[tuple[str, ...], ...],
         *tensors: Tensor,
@@ -207,7 +208,10 @@ class _Recomputed(torch.autograd.Function):
         with _GeneratorsAt(ctx.generators, senders.device), torch.autocast(kind, dtype, enabled):
             for receivers, links in ctx.graph.blocks():
                 block = ctx.graph.block(receivers, links)
-                rows = [block.at_senders(senders), *(block.at_receivers(table[receivers]) for table in of_receivers)]
+                rows = [
+                    block.gather_senders(senders),
+                    *(block.gather_receivers(table[receivers]) for table in of_receivers),
+                ]
                 rows = [row.requires_grad_(needed) for row, needed in zip(rows, wanted, strict=False)]
                 leaves = [tensor for tensor, needed in zip((*rows, *weights), wanted, strict=True) if needed]
                 with torch.enable_grad():
@@ -228,7 +232,7 @@ class _Recomputed(torch.autograd.Function):
                     if index == 0:
                         total.index_add_(0, block.sender, part)
                     elif index < count:
-                        total[receivers] += block.total(part)
+                        total[receivers] += block.scatter_sum(part)
                     else:
                         total += part
         return None, None, None, None, *gradients
@@ -261,7 +265,7 @@ def _set_generators(states: list[Tensor], device: torch.device) -> None:
         torch.get_device_module(device).set_rng_state(states[1], device)
 
 
-def _learned_links(graph: Links) -> bool:
+def _learned_links(graph: EdgeList) -> bool:
     return any(value is not None and value.requires_grad for value in (graph.weight, graph.feature))
 
 

@@ -37,8 +37,8 @@ class Communication(nn.Module, abc.ABC):
 
     ``links`` gives ``links.weight`` [E] and ``links.feature`` [E, F] (None where there are none), and what needs a
     whole neighbourhood: ``links.softmax(logits)`` over the links that a receiver receives on, ``links.degree()`` their
-    number [R], ``links.total(values)`` their sum [R, F], and ``links.at_receivers(table)``, which brings a value of
-    each receiver [R, F] to its links [E, F].
+    number [R], ``links.scatter_sum(values)`` their sum [R, F], and ``links.gather_receivers(table)``, which brings a
+    value of each receiver [R, F] to its links [E, F].
     """
 
     @abc.abstractmethod
@@ -79,8 +79,8 @@ class NormalizedAdjacency(GraphShift):
     def forward(self, sender: Tensor, receiver: Tensor, links: Graph) -> Tensor:
         """Return ``w sender / sum of w`` [E, D]."""
         if links.weight is None:
-            return sender / links.at_receivers(links.degree()).unsqueeze(-1).clamp(min=1)
-        whole = links.at_receivers(links.total(links.weight.unsqueeze(-1)))
+            return sender / links.gather_receivers(links.degree()).unsqueeze(-1).clamp(min=1)
+        whole = links.gather_receivers(links.scatter_sum(links.weight.unsqueeze(-1)))
         return links.weight.unsqueeze(-1) * sender / torch.where(whole == 0, 1.0, whole)
 
 

@@ -21,7 +21,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
 from modgnn_rl.nn.communication import Adjacency, Laplacian
-from modgnn_rl.nn.graph import Links
+from modgnn_rl.nn.graph import EdgeList
 
 __all__ = ["is_linear_map", "rewrite"]
 
@@ -33,7 +33,7 @@ def is_linear_map(module: nn.Module) -> bool:
     return type(module) in (nn.Linear, nn.Identity) or getattr(type(module), "is_linear_map", False)
 
 
-def rewrite(graph: Links, f_com: nn.Module, f_pre: nn.Module) -> Rewritten | None:
+def rewrite(graph: EdgeList, f_com: nn.Module, f_pre: nn.Module) -> Rewritten | None:
     """A function of the senders' and the receivers' tables [S, D], [R, D] that returns the sum, or None.
 
     None is returned where the modules are of another kind, carry hooks, or weigh links.
@@ -71,7 +71,7 @@ def rewrite(graph: Links, f_com: nn.Module, f_pre: nn.Module) -> Rewritten | Non
     return run
 
 
-def _sum_of_linear(graph: Links, modules: list[nn.Module], senders: Tensor, receivers: Tensor | None) -> Tensor:
+def _sum_of_linear(graph: EdgeList, modules: list[nn.Module], senders: Tensor, receivers: Tensor | None) -> Tensor:
     """The sum over neighbours of an affine map of a graph shift: sum first, map afterwards."""
     if len(graph) == 0:
         total = senders.new_zeros(graph.num_receivers, senders.shape[-1])
@@ -82,7 +82,7 @@ def _sum_of_linear(graph: Links, modules: list[nn.Module], senders: Tensor, rece
     return _after_the_sum(graph, modules, total)
 
 
-def _after_the_sum(graph: Links, modules: list[nn.Module], total: Tensor) -> Tensor:
+def _after_the_sum(graph: EdgeList, modules: list[nn.Module], total: Tensor) -> Tensor:
     """The sum over links of an affine map, from the sum over links of what goes into it."""
     if not modules:
         return total
@@ -117,7 +117,7 @@ class _ReluOverLinks(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, graph: Links, incoming: Tensor, own: Tensor | None, *weights: Tensor | None) -> Tensor:
+    def forward(ctx: Any, graph: EdgeList, incoming: Tensor, own: Tensor | None, *weights: Tensor | None) -> Tensor:
         ctx.graph = graph
         ctx.save_for_backward(incoming, own, *weights)
         layers = _Layers(graph, incoming, own, weights)
@@ -131,7 +131,7 @@ class _ReluOverLinks(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        graph: Links = ctx.graph
+        graph: EdgeList = ctx.graph
         incoming, own, *weights = ctx.saved_tensors
         layers = _Layers(graph, incoming, own, weights)
         gradients = [None if weight is None else torch.zeros_like(weight) for weight in weights]
@@ -150,7 +150,7 @@ class _ReluOverLinks(torch.autograd.Function):
 class _Layers:
     """The layers over blocks of links, in buffers that all blocks share."""
 
-    def __init__(self, graph: Links, incoming: Tensor, own: Tensor | None, weights: Any) -> None:
+    def __init__(self, graph: EdgeList, incoming: Tensor, own: Tensor | None, weights: Any) -> None:
         self.graph, self.incoming, self.own = graph, incoming, own
         self.weights, self.biases = weights[::2], weights[1::2]
         self.transposed = [weight.t().contiguous() for weight in self.weights]

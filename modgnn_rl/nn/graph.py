@@ -1,8 +1,8 @@
 """Graphs of links between agents, in two forms with one interface: a list of links, or all pairs with a mask.
 
-The nodes of all graphs of a batch are numbered through: agent i of graph g is node ``g N + i``. `Links` computes only
-what is linked; `Pairs` computes all pairs, in shapes that do not depend on the data, as compilers and ``vmap`` need.
-`modgnn_rl.nn.topology.Topology` reads what a user has and chooses the form.
+The nodes of all graphs of a batch are numbered through: agent i of graph g is node ``g N + i``. `EdgeList` computes
+only what is linked; `DenseGraph` computes all pairs, in shapes that do not depend on the data, as compilers and
+``vmap`` need. `modgnn_rl.nn.topology.Topology` reads what a user has and chooses the form.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import abc
 import torch
 from torch import Tensor
 
-from modgnn_rl.utils.tensors import places_of
+from modgnn_rl.utils.tensors import flatnonzero
 
-__all__ = ["AGGREGATIONS", "Graph", "Links", "Pairs"]
+__all__ = ["AGGREGATIONS", "DenseGraph", "EdgeList", "Graph"]
 
 AGGREGATIONS = ("sum", "mean", "max")
 BLOCK = {"cpu": 8192}  # links worked on at once: their activations stay in the processor's cache
@@ -37,11 +37,11 @@ class Graph(abc.ABC):
     feature: Tensor | None
 
     @abc.abstractmethod
-    def at_senders(self, table: Tensor) -> Tensor:
+    def gather_senders(self, table: Tensor) -> Tensor:
         """The senders' rows of a table of nodes: [S, ...] -> [E, ...]."""
 
     @abc.abstractmethod
-    def at_receivers(self, table: Tensor) -> Tensor:
+    def gather_receivers(self, table: Tensor) -> Tensor:
         """The receivers' rows of a table of nodes: [R, ...] -> [E, ...]."""
 
     @abc.abstractmethod
@@ -49,11 +49,11 @@ class Graph(abc.ABC):
         """Number of links that each receiver receives on, integer [R]."""
 
     @abc.abstractmethod
-    def total(self, values: Tensor) -> Tensor:
+    def scatter_sum(self, values: Tensor) -> Tensor:
         """Sum over each receiver's links: [E, F] -> [R, F]; zero without links."""
 
     @abc.abstractmethod
-    def largest(self, values: Tensor) -> Tensor:
+    def scatter_max(self, values: Tensor) -> Tensor:
         """Maximum over each receiver's links: [E, F] -> [R, F]; zero without links."""
 
     @abc.abstractmethod
@@ -63,18 +63,18 @@ class Graph(abc.ABC):
     def aggregate(self, values: Tensor, aggregation: str = "sum") -> Tensor:
         """Aggregate over each receiver's links: [E, F] -> [R, F]; ``sum``, ``mean`` or ``max``, zero without links."""
         if aggregation == "max":
-            return self.largest(values)
-        total = self.total(values)
+            return self.scatter_max(values)
+        total = self.scatter_sum(values)
         return total / self.degree().clamp(min=1).unsqueeze(-1) if aggregation == "mean" else total
 
     def softmax(self, logits: Tensor) -> Tensor:
         """Softmax over each receiver's links: [E, H] -> [E, H]."""
-        shifted = (logits - self.at_receivers(self.largest(logits.detach()))).exp()
+        shifted = (logits - self.gather_receivers(self.scatter_max(logits.detach()))).exp()
         # The largest contributes 1, so that less stands only where there is no link.
-        return shifted / self.at_receivers(self.total(shifted)).clamp(min=1)
+        return shifted / self.gather_receivers(self.scatter_sum(shifted)).clamp(min=1)
 
 
-class Links(Graph):
+class EdgeList(Graph):
     """A list of links, ordered by receiver.
 
     Args:
@@ -105,12 +105,12 @@ class Links(Graph):
     def __len__(self) -> int:
         return len(self.sender)
 
-    def at_senders(self, table: Tensor) -> Tensor:
-        """See `Graph.at_senders`."""
+    def gather_senders(self, table: Tensor) -> Tensor:
+        """See `Graph.gather_senders`."""
         return table.index_select(0, self.sender)
 
-    def at_receivers(self, table: Tensor) -> Tensor:
-        """See `Graph.at_receivers`."""
+    def gather_receivers(self, table: Tensor) -> Tensor:
+        """See `Graph.gather_receivers`."""
         return table.index_select(0, self.receiver)
 
     def degree(self) -> Tensor:
@@ -124,29 +124,29 @@ class Links(Graph):
         degree = self.degree()
         return degree.cumsum(0) - degree
 
-    def total(self, values: Tensor) -> Tensor:
+    def scatter_sum(self, values: Tensor) -> Tensor:
         """See `Graph.total`."""
         return values.new_zeros(self.num_receivers, *values.shape[1:]).index_add(0, self.receiver, values)
 
-    def largest(self, values: Tensor) -> Tensor:
+    def scatter_max(self, values: Tensor) -> Tensor:
         """See `Graph.largest`."""
         zeros = values.new_zeros(self.num_receivers, *values.shape[1:])
         index = self.receiver.view(-1, *[1] * (values.ndim - 1)).expand_as(values)
         return zeros.scatter_reduce(0, index, values, "amax", include_self=False)
 
-    def between(self, senders: Tensor, receivers: Tensor) -> Links:
+    def between(self, senders: Tensor, receivers: Tensor) -> EdgeList:
         """See `Graph.between`."""
         if senders.all() and receivers.all():
             return self
         # index_select takes a third of the time of indexing.
-        return self.only(places_of(senders.index_select(0, self.sender) & receivers.index_select(0, self.receiver)))
+        return self.only(flatnonzero(senders.index_select(0, self.sender) & receivers.index_select(0, self.receiver)))
 
-    def only(self, chosen: Tensor) -> Links:
+    def only(self, chosen: Tensor) -> EdgeList:
         """The links of the given numbers, ascending [E']."""
         taken = {
             name: value if value is None else value.index_select(0, chosen) for name, value in self._of_links().items()
         }
-        return Links(
+        return EdgeList(
             self.sender.index_select(0, chosen),
             self.receiver.index_select(0, chosen),
             self.num_senders,
@@ -171,10 +171,10 @@ class Links(Graph):
             for index in range(len(cuts) - 1)
         ]
 
-    def block(self, receivers: slice, links: slice) -> Links:
+    def block(self, receivers: slice, links: slice) -> EdgeList:
         """The links of some receivers as a graph with these receivers only, numbered from 0."""
         attributes = {name: None if value is None else value[links] for name, value in self._of_links().items()}
-        return Links(
+        return EdgeList(
             self.sender[links],
             self.receiver[links] - receivers.start,
             self.num_senders,
@@ -183,7 +183,7 @@ class Links(Graph):
         )
 
 
-class Pairs(Graph):
+class DenseGraph(Graph):
     """All pairs, and a mask that tells which are linked.
 
     Where gradients are wanted, a pair without a link gets the data of some link, or ones (the sender's) and zeros if
@@ -204,14 +204,14 @@ class Pairs(Graph):
         self.weight = None if weight is None else self._or_of_a_link(weight.reshape(-1))
         self.feature = None if feature is None else self._or_of_a_link(feature.reshape(-1, feature.shape[-1]))
 
-    def at_senders(self, table: Tensor) -> Tensor:
-        """See `Graph.at_senders`."""
+    def gather_senders(self, table: Tensor) -> Tensor:
+        """See `Graph.gather_senders`."""
         graphs, receivers, senders = self.mask.shape
         spread = table.unflatten(0, (graphs, 1, senders)).expand(-1, receivers, -1, *table.shape[1:])
         return self._or_of_a_link(spread.flatten(0, 2), without_any=1)
 
-    def at_receivers(self, table: Tensor) -> Tensor:
-        """See `Graph.at_receivers`."""
+    def gather_receivers(self, table: Tensor) -> Tensor:
+        """See `Graph.gather_receivers`."""
         graphs, receivers, senders = self.mask.shape
         spread = table.unflatten(0, (graphs, receivers, 1)).expand(-1, -1, senders, *table.shape[1:])
         return self._or_of_a_link(spread.flatten(0, 2))
@@ -236,14 +236,14 @@ class Pairs(Graph):
         some = torch.cat((values, stand_in)).index_select(0, self._some_link)
         return torch.where(self.mask.reshape(-1, *[1] * (values.ndim - 1)), values, some)
 
-    def total(self, values: Tensor) -> Tensor:
+    def scatter_sum(self, values: Tensor) -> Tensor:
         """See `Graph.total`."""
         return self._by_receiver(self.only_linked(values)).sum(1)
 
-    def largest(self, values: Tensor) -> Tensor:
+    def scatter_max(self, values: Tensor) -> Tensor:
         """See `Graph.largest`."""
         if self.mask.shape[-1] == 0:
-            return self.total(values)
+            return self.scatter_sum(values)
         largest = self._by_receiver(self.only_linked(values, -torch.inf)).amax(1)
         return torch.where(self.degree().view(-1, *[1] * (values.ndim - 1)) > 0, largest, 0.0)
 
@@ -254,8 +254,8 @@ class Pairs(Graph):
     def _by_receiver(self, values: Tensor) -> Tensor:
         return values.unflatten(0, (self.num_receivers, self.mask.shape[-1]))
 
-    def between(self, senders: Tensor, receivers: Tensor) -> Pairs:
+    def between(self, senders: Tensor, receivers: Tensor) -> DenseGraph:
         """See `Graph.between`."""
         graphs, of_receivers, of_senders = self.mask.shape
         mask = self.mask & senders.view(graphs, 1, of_senders) & receivers.view(graphs, of_receivers, 1)
-        return Pairs(mask, self.weight, self.feature)
+        return DenseGraph(mask, self.weight, self.feature)

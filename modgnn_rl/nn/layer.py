@@ -11,11 +11,11 @@ from tensordict.utils import unravel_key
 from torch import Tensor, nn
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.nn.aggregation import Hop, Tables, aggregate, call, suited_form
+from modgnn_rl.nn.aggregation import Hop, NodeFeatures, aggregate, call, suited_form
 from modgnn_rl.nn.communication import GraphShift, Laplacian
 from modgnn_rl.nn.graph import AGGREGATIONS, Graph
 from modgnn_rl.nn.topology import Topology
-from modgnn_rl.utils.tensors import keep_rows, places_of, stack_padded
+from modgnn_rl.utils.tensors import flatnonzero, mask_rows, stack_padded
 
 __all__ = ["STARTS", "ModGNNLayer", "Recorder", "only_finite"]
 
@@ -154,7 +154,7 @@ class ModGNNLayer(nn.Module):
         adjacency: Tensor | Topology,
         is_init: Tensor | None = None,
         messages: Tensor | None = None,
-        own: Tables | None = None,
+        own: NodeFeatures | None = None,
         *,
         receivers: Tensor | None = None,
         record: Recorder | None = None,
@@ -200,7 +200,7 @@ class ModGNNLayer(nn.Module):
         first = data  # of start="repeat"
         sent = []
         for hop in range(1, self.hops + 1):
-            sent.append(keep_rows(data, held, torch.nan).to(seen.dtype))
+            sent.append(mask_rows(data, held, torch.nan).to(seen.dtype))
             _record(record, "messages", hop - 1, sent[-1])
             stored = None if messages is None else messages[..., hop - 1, : data.shape[-1]]
             before, held = _one_step_earlier(data, held, stored, is_init, shape)
@@ -209,12 +209,12 @@ class ModGNNLayer(nn.Module):
                 before, held = torch.where((held | ~known).unsqueeze(-1), before, first), held | known
             elif self.start == "zero":
                 held = torch.ones_like(held)
-            graph = topology.wanted().between(held, _take(held, rows))
+            graph = topology.target_edges().between(held, _take(held, rows))
             incoming = Hop(before, _take(before, rows), mine)
             summed = self._summed(hop, self.f_pre[hop], graph, incoming, record)
             total = total + self._contribution(hop, summed, mine, _take(held, rows), topology, record)
             if hop < self.hops:
-                everyone = topology.everyone()
+                everyone = topology.all_edges()
                 data = self._summed(hop, None, everyone.between(held, held), Hop(before, before, flat))
                 if self.start == "repeat":
                     first = self._summed(hop, None, everyone.between(known, known), Hop(first, first, flat))
@@ -222,11 +222,11 @@ class ModGNNLayer(nn.Module):
                     held = held & topology.exists
 
         output = call(self.f_final, total, mine)
-        output = keep_rows(output, _take(sees, rows), torch.nan)
+        output = mask_rows(output, _take(sees, rows), torch.nan)
         if rows is not None:
             output = output.new_zeros(shape.numel(), output.shape[-1]).index_copy(0, rows, output)
         elif topology.wanted_nodes is not None:
-            output = keep_rows(output, topology.wanted_nodes)
+            output = mask_rows(output, topology.wanted_nodes)
         _record(record, "f_final", None, output)
         messages = stack_padded(sent) if sent else data.new_zeros(shape.numel(), 0, data.shape[-1])
         return output.unflatten(0, shape), messages.unflatten(0, shape)
@@ -247,7 +247,13 @@ class ModGNNLayer(nn.Module):
         return aggregate(graph, self.f_com[hop - 1], module, incoming, self.aggregation, take)
 
     def _contribution(
-        self, hop: int, summed: Tensor, mine: Tables, held: Tensor | None, topology: Topology, record: Recorder | None
+        self,
+        hop: int,
+        summed: Tensor,
+        mine: NodeFeatures,
+        held: Tensor | None,
+        topology: Topology,
+        record: Recorder | None,
     ) -> Tensor:
         """F_mid of one hop's sum; zero for agents that hold no such hop."""
         _record(record, "sum", hop, summed)
@@ -256,13 +262,13 @@ class ModGNNLayer(nn.Module):
         return result
 
 
-def _call_for(who: Tensor | None, topology: Topology, module: nn.Module, data: Tensor, own: Tables) -> Tensor:
+def _call_for(who: Tensor | None, topology: Topology, module: nn.Module, data: Tensor, own: NodeFeatures) -> Tensor:
     """Apply a submodule for some agents, bool [R], or all; zeros for the others, whose rows no batch statistics see."""
     if who is None:
         return call(module, data, own)
     if topology.as_pairs or who.all():
-        return keep_rows(call(module, data, own), who)
-    rows = places_of(who)
+        return mask_rows(call(module, data, own), who)
+    rows = flatnonzero(who)
     result = call(module, _take(data, rows), {key: _take(value, rows) for key, value in own.items()})
     return result.new_zeros(len(data), *result.shape[1:]).index_copy(0, rows, result)
 
@@ -277,7 +283,7 @@ def _record(record: Recorder | None, name: str, hop: int | None, value: Tensor) 
 
 
 def only_finite(
-    observation: Tensor, own: Tables, exists: Tensor | None = None
+    observation: Tensor, own: NodeFeatures, exists: Tensor | None = None
 ) -> tuple[Tensor, dict[tuple[str, ...], Tensor], Tensor]:
     """Zero all data of agents that see anything not finite or do not exist, bool [R]; also returns the others."""
     sees = observation.isfinite().all(-1)
@@ -285,8 +291,8 @@ def only_finite(
         sees = sees & exists
     for value in own.values():
         sees = sees & value.isfinite().flatten(1).all(-1)
-    clean = {key: keep_rows(value, sees) for key, value in own.items()}
-    return keep_rows(observation, sees), clean, sees
+    clean = {key: mask_rows(value, sees) for key, value in own.items()}
+    return mask_rows(observation, sees), clean, sees
 
 
 def _one_step_earlier(
@@ -306,7 +312,7 @@ def _one_step_earlier(
     if is_init is not None:
         held_before = held_before & ~is_init.unsqueeze(-1)
     before, held_before = before.flatten(0, -2), held_before.flatten()
-    return keep_rows(before, held_before), held_before
+    return mask_rows(before, held_before), held_before
 
 
 def _per_hop(name: str, module: PerHop, hops: int) -> nn.ModuleList:

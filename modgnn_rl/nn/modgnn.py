@@ -23,9 +23,9 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.nn.aggregation import suited_form
 from modgnn_rl.nn.graph import Graph
 from modgnn_rl.nn.layer import ModGNNLayer
-from modgnn_rl.nn.primer import AgentCache
+from modgnn_rl.nn.primer import RecurrentStatePrimer
 from modgnn_rl.nn.topology import FORMS, Topology
-from modgnn_rl.utils.tensors import is_transformed, keep_rows
+from modgnn_rl.utils.tensors import is_transformed, mask_rows
 
 __all__ = ["ModGNN", "ModGNNLayer"]
 
@@ -235,13 +235,13 @@ class ModGNN(TensorDictModuleBase):
         for number, layer in enumerate(self.layers):
             stored = None if messages is None else messages[..., first : first + layer.hops, :]
             is_last = number == len(self.layers) - 1
-            graphs = topology if is_last else topology.towards(None if needed is None else needed[number])
+            graphs = topology if is_last else topology.with_targets(None if needed is None else needed[number])
             if record is not None:
                 record.begin_layer(number, graphs, self._requests)
             output, sends = layer(seen, graphs, is_init, stored, own, record=record)
             if needed is not None and not is_last:
                 # What is not made is NaN: nobody sends it.
-                output = keep_rows(output.flatten(0, -2), needed[number].flatten(), torch.nan).view_as(output)
+                output = mask_rows(output.flatten(0, -2), needed[number].flatten(), torch.nan).view_as(output)
             seen = torch.cat((seen, output), -1)
             first += layer.hops
             sent.append(sends)
@@ -263,9 +263,9 @@ class ModGNN(TensorDictModuleBase):
             needed.insert(0, receivers)
         return needed
 
-    def make_tensordict_primer(self) -> AgentCache:
+    def make_tensordict_primer(self) -> RecurrentStatePrimer:
         """The transform that puts ``messages`` into an environment's specs, sized by that environment."""
-        return AgentCache(self, [self.messages_key], is_init=self._keys[2])
+        return RecurrentStatePrimer(self, [self.messages_key], is_init=self._keys[2])
 
     def _own_keys(self) -> dict[tuple[str, ...], NestedKey]:
         """Where the data lie that keyed submodules read under ``"own"``, by name."""
@@ -285,7 +285,7 @@ class ModGNN(TensorDictModuleBase):
         if self.hops and not self._warned:
             self._warned = True
             warnings.warn(
-                f"ModGNN finds no '{self._keys[2]}', or no '{self._keys[3]}' in mid-flight, and remembers nothing: "
+                f"ModGNN finds no '{self._keys[2]}', or no '{self._keys[3]}' in mid-rollout, and remembers nothing: "
                 "append InitTracker() and policy.make_tensordict_primer() to the environment",
                 stacklevel=3,
             )
@@ -316,7 +316,7 @@ class _Requested:
         if name in ("f_input", "messages") or wanted is None:
             pass  # all agents send
         elif rows is None or len(value) == self.topology.num_nodes:
-            value = keep_rows(value, wanted)
+            value = mask_rows(value, wanted)
         else:
             value = value.new_zeros(self.topology.num_nodes, value.shape[-1]).index_copy(0, rows, value)
         # A copy, since the next module may work in place.

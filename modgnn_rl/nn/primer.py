@@ -19,7 +19,7 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl.errors import InputError
 
-__all__ = ["AgentCache", "missing"]
+__all__ = ["RecurrentStatePrimer", "missing"]
 
 
 def missing(like: Tensor) -> Tensor:
@@ -27,7 +27,7 @@ def missing(like: Tensor) -> Tensor:
     return torch.full_like(like, torch.nan)
 
 
-class AgentCache(TensorDictPrimer):
+class RecurrentStatePrimer(TensorDictPrimer):
     """Primer whose shapes follow the environment that it is appended to, so that a module serves any number of agents.
 
     It adds the keys to the environment's specs and zeroes them at resets; modules look at ``is_init`` and read no cache

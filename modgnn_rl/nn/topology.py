@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.nn.graph import Graph, Links, Pairs
-from modgnn_rl.utils.tensors import is_transformed, places_of
+from modgnn_rl.nn.graph import DenseGraph, EdgeList, Graph
+from modgnn_rl.utils.tensors import flatnonzero, is_transformed
 
 __all__ = ["FORMS", "Topology", "as_matrix", "reachable"]
 
@@ -76,24 +76,24 @@ class Topology:
         """Agents of all graphs together."""
         return self.adjacency.shape[0] * self.num_agents
 
-    def everyone(self) -> Graph:
+    def all_edges(self) -> Graph:
         """The graph of all agents."""
         if self._everyone is None:
             self._everyone = self._make_pairs() if self.as_pairs else self._make_links(self.exists_rows())
         return self._everyone
 
-    def wanted(self) -> Graph:
+    def target_edges(self) -> Graph:
         """The graph of the links to the wanted receivers; as links, its receivers are `rows`."""
         if self._wanted is None:
             if self.wanted_nodes is None:
-                self._wanted = self.everyone()
+                self._wanted = self.all_edges()
             elif self.rows is None:
-                self._wanted = self.everyone().between(torch.ones_like(self.wanted_nodes), self.wanted_nodes)
+                self._wanted = self.all_edges().between(torch.ones_like(self.wanted_nodes), self.wanted_nodes)
             else:
                 self._wanted = self._make_links(self.rows, compact=True)
         return self._wanted
 
-    def towards(self, receivers: Tensor | None) -> Topology:
+    def with_targets(self, receivers: Tensor | None) -> Topology:
         """The same graphs with other outputs wanted, bool [*B, N]; None: those of all agents that exist."""
         if receivers is None and self.wanted_nodes is self.exists:
             return self
@@ -108,12 +108,12 @@ class Topology:
         else:
             self.wanted_nodes = wanted & self.exists
         # Numbers of the wanted nodes, as long as shapes may depend on data.
-        self.rows = None if self.as_pairs or self.wanted_nodes is None else places_of(self.wanted_nodes)
+        self.rows = None if self.as_pairs or self.wanted_nodes is None else flatnonzero(self.wanted_nodes)
         self._wanted = None
 
     def exists_rows(self) -> Tensor | None:
         """Numbers of the nodes that exist; None: all."""
-        return None if self.exists is None else places_of(self.exists)
+        return None if self.exists is None else flatnonzero(self.exists)
 
     def _suits_pairs(self, *, some: bool) -> bool:
         if is_transformed():
@@ -126,7 +126,7 @@ class Topology:
             and 2 * int(self.adjacency.count_nonzero()) >= self.adjacency.numel()
         )
 
-    def _make_links(self, rows: Tensor | None, *, compact: bool = False) -> Links:
+    def _make_links(self, rows: Tensor | None, *, compact: bool = False) -> EdgeList:
         """The links to some nodes, or to all; ``compact`` numbers the receivers by their place among the rows."""
         size, nodes = self.num_agents, self.num_nodes
         if self.is_edge_list:
@@ -134,7 +134,7 @@ class Topology:
         else:
             linked = self.adjacency.reshape(nodes, size).bool()
             linked = linked if rows is None else linked.index_select(0, rows)
-            position = places_of(linked.flatten())
+            position = flatnonzero(linked.flatten())
             receiver = position.div(size, rounding_mode="floor")
             sender = position - receiver * size
             if rows is not None:
@@ -148,7 +148,7 @@ class Topology:
             place = torch.empty(nodes, dtype=torch.long, device=rows.device)
             place[rows] = torch.arange(len(rows), device=rows.device)
             receiver = place[receiver]
-        return Links(
+        return EdgeList(
             sender,
             receiver,
             nodes,
@@ -171,11 +171,11 @@ class Topology:
             chosen = torch.zeros(self.num_nodes, dtype=torch.bool, device=rows.device)
             chosen[rows] = True
             valid = valid & chosen[receiver.clamp(min=0)]
-        position = places_of(valid)
+        position = flatnonzero(valid)
         position = position[receiver[position].argsort(stable=True)]
         return sender[position], receiver[position], position
 
-    def _make_pairs(self) -> Pairs:
+    def _make_pairs(self) -> DenseGraph:
         size = self.num_agents
         weight, feature = self.weight, self.feature
         if self.is_edge_list:
@@ -193,16 +193,16 @@ class Topology:
         if self.exists is not None:
             exists = self.exists.view(len(self.adjacency), size)
             mask = mask & exists.unsqueeze(-1) & exists.unsqueeze(-2)
-        return Pairs(mask, weight, feature)
+        return DenseGraph(mask, weight, feature)
 
     def spread_links(self, values: Tensor, graph: Graph) -> Tensor:
         """Values of links [E, F] where the user gave them: [G, N, N, F], or [G, E, F] of an edge list; else zero."""
         shape = (len(self.adjacency), *((self.adjacency.shape[-1],) if self.is_edge_list else (self.num_agents,) * 2))
-        if isinstance(graph, Links):
+        if isinstance(graph, EdgeList):
             assert graph.position is not None
             everywhere = values.new_zeros(torch.Size(shape).numel(), values.shape[-1])
             return everywhere.index_copy(0, graph.position, values).unflatten(0, shape)
-        assert isinstance(graph, Pairs)
+        assert isinstance(graph, DenseGraph)
         values = graph.only_linked(values)
         if self.is_edge_list:
             sender, receiver, valid = self._listed_nodes()
@@ -239,8 +239,8 @@ def _check_numbers(edges: Tensor, num_agents: int) -> None:
 
 def as_matrix(adjacency: Tensor, num_agents: int) -> Tensor:
     """A graph as a bool matrix [..., N, N], from any form that `modgnn_rl.nn.topology.Topology` reads."""
-    graph = Topology(adjacency, num_agents, form="pairs").everyone()
-    assert isinstance(graph, Pairs)
+    graph = Topology(adjacency, num_agents, form="pairs").all_edges()
+    assert isinstance(graph, DenseGraph)
     return graph.mask.view(*adjacency.shape[:-2], num_agents, num_agents)
 
 

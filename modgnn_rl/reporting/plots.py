@@ -30,7 +30,7 @@ class Curve:
 
     Attributes:
         x: positions; a NaN in `y` breaks the line.
-        y: the mean over seeds or flights.
+        y: the mean over seeds or rollouts.
         low: lower end of the interval; None draws no band.
         high: upper end of the interval.
     """
@@ -46,7 +46,7 @@ class Curve:
 
         Args:
             x: positions ``[P]``.
-            values: one curve a seed or flight ``[S, P]``; where one of them is NaN, the line is broken.
+            values: one curve a seed or rollout ``[S, P]``; where one of them is NaN, the line is broken.
             rng: source of the resampling.
         """
         curves = np.asarray(values, dtype=np.float64)

@@ -36,7 +36,7 @@ class Table:
         title: what the table shows.
         header: name of each column.
         rows: one cell for each column: text as it is, a float with three decimals, an int with all digits, NaN as "-".
-        caption: units, number of flights, how to read it.
+        caption: units, number of rollouts, how to read it.
         best: columns whose best cells are marked, by position, and which end is better. A cell of text counts with
             the first number in it; cells that show the same number are marked together.
         references: first cells of the rows that stand there for comparison and are never marked, such as the expert.

@@ -33,20 +33,20 @@ class Side:
 
     model: str
     hops: tuple[int, ...]
-    world: str = VALIDATION
+    env_config: str = VALIDATION
     figure: str = "error"
 
     def __str__(self) -> str:
         hops = (
             "" if self.model == "central" else f", K = {' to '.join(map(str, sorted({self.hops[0], self.hops[-1]})))}"
         )
-        agents = f", N = {self.world[1:]}" if self.world != VALIDATION else ""
+        agents = f", N = {self.env_config[1:]}" if self.env_config != VALIDATION else ""
         return f"{NAMES[self.model]}{hops}{agents}"
 
     def values(self, measurements: Measurements) -> NDArray[np.float64] | None:
-        """The figure of all flights [S, F]; None where something of it failed or was not flown."""
+        """The figure of all rollouts [S, F]; None where something of it failed or was not flown."""
         hops = (1,) if self.model == "central" else self.hops
-        found = [measurements.values(Subject(self.model, hop), self.world, self.figure) for hop in hops]
+        found = [measurements.values(Subject(self.model, hop), self.env_config, self.figure) for hop in hops]
         known = [values for values in found if values is not None]
         same = len(known) == len(found) and len({values.shape for values in known}) == 1
         return np.mean(known, axis=0) if same else None
@@ -69,9 +69,9 @@ def _levels() -> Claim:
     return Claim(text, tuple((sides[better], sides[worse]) for better, worse in pairs))
 
 
-def _best(text: str, figure: str, world: str, others: Sequence[str], hops: Sequence[int] = HOPS) -> Claim:
+def _best(text: str, figure: str, env_config: str, others: Sequence[str], hops: Sequence[int] = HOPS) -> Claim:
     pairs = [
-        (Side("modgnn_mlp", (hop,), world, figure), Side(other, (hop,), world, figure))
+        (Side("modgnn_mlp", (hop,), env_config, figure), Side(other, (hop,), env_config, figure))
         for hop in hops
         for other in others
     ]
@@ -83,33 +83,33 @@ def _more_hops() -> Claim:
         (Side("modgnn_mlp", (more,), "N32"), Side("modgnn_mlp", (fewer,), "N32"))
         for fewer, more in itertools.pairwise(HOPS)
     ]
-    return Claim("ModGNN-MLP gains with K on its own flights", tuple(pairs))
+    return Claim("ModGNN-MLP gains with K on its own rollouts", tuple(pairs))
 
 
 def _no_gain() -> Claim:
     pairs = [(Side(model, (2,), "N32"), Side(model, (3,), "N32")) for model in BASELINES]
-    return Claim("The baselines do not gain with K: K = 3 is worse than K = 2 on their own flights", tuple(pairs))
+    return Claim("The baselines do not gain with K: K = 3 is worse than K = 2 on their own rollouts", tuple(pairs))
 
 
 def _abroad() -> Claim:
     pairs = [
-        (Side("modgnn_mlp", (hop,), world), Side(model, (hop,), "N32"))
+        (Side("modgnn_mlp", (hop,), env_config), Side(model, (hop,), "N32"))
         for hop in HOPS
-        for world in ("N16", "N64")
+        for env_config in ("N16", "N64")
         for model in BASELINES
     ]
     return Claim("ModGNN-MLP errs less with 16 or 64 agents than the baselines do with 32", tuple(pairs))
 
 
-def _submodule(text: str, better: str, worse: str, world: str) -> Claim:
-    return Claim(text, tuple((Side(better, (hop,), world), Side(worse, (hop,), world)) for hop in HOPS))
+def _submodule(text: str, better: str, worse: str, env_config: str) -> Claim:
+    return Claim(text, tuple((Side(better, (hop,), env_config), Side(worse, (hop,), env_config)) for hop in HOPS))
 
 
 CLAIMS = (
     _levels(),
     _best("ModGNN-MLP has the lowest validation error at every K", "error", VALIDATION, (*OTHERS, "central")),
     *(
-        _best(f"ModGNN-MLP is best on its own flights at every K: {name}", figure, "N32", (*OTHERS, "central"))
+        _best(f"ModGNN-MLP is best on its own rollouts at every K: {name}", figure, "N32", (*OTHERS, "central"))
         for figure, name in FIGURES.items()
     ),
     _more_hops(),
@@ -122,7 +122,7 @@ CLAIMS = (
     ),
     _abroad(),
     _submodule("f_pre matters more than f_mid: validation error", "no_mid", "no_pre", VALIDATION),
-    _submodule("f_pre matters more than f_mid: error on own flights", "no_mid", "no_pre", "N32"),
+    _submodule("f_pre matters more than f_mid: error on own rollouts", "no_mid", "no_pre", "N32"),
 )
 
 
@@ -157,7 +157,7 @@ def _compare(better: Side, worse: Side, measurements: Measurements) -> Verdict:
     first, second = better.values(measurements), worse.values(measurements)
     if first is None or second is None:
         return Verdict(better, worse, None, None)
-    rng, paired = np.random.default_rng(0), better.world == worse.world
+    rng, paired = np.random.default_rng(0), better.env_config == worse.env_config
     chance = probability_of_improvement(first, second, rng=rng, paired=paired, resamples=1000)
     return Verdict(better, worse, chance, (float(first.mean()), float(second.mean())))
 
@@ -184,8 +184,8 @@ def claim_tables(measurements: Measurements) -> dict[str, Table]:
     if measurements.config.seeds == 1:
         caption += " With one training of each model this tells of these trainings, not of the architectures."
     about = (
-        "Probability that the first has the lower figure on a flight, over all pairs of seeds (Agarwal et al. 2021), "
-        "with its 95 % bootstrap interval over seeds and flights, and both means."
+        "Probability that the first has the lower figure on a rollout, over all pairs of seeds (Agarwal et al. 2021), "
+        "with its 95 % bootstrap interval over seeds and rollouts, and both means."
     )
     header = ["the paper says", "here", "comparisons that hold", "reversed", "weakest [95 %]"]
     every = ["claim", "comparison", "first", "second", "probability [95 %]", "here"]
@@ -210,7 +210,7 @@ def _margins(measurements: Measurements) -> Table:
         )
         body.append([str(hop), *map(_less, (*errors, *spreads))])
     caption = (
-        "Error on own flights, and standard deviation of the separation over time, agents and flights (Table 2): how "
+        "Error on own rollouts, and standard deviation of the separation over time, agents and rollouts (Table 2): how "
         "far that of ModGNN-MLP lies below the lower one of GCN and GCN [+f_final]."
     )
     header = ["K", "error, paper", "error", "spread of separation, paper", "spread of separation"]

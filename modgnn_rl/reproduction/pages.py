@@ -35,7 +35,7 @@ QUESTIONS = {
     "size": "How does one set of weights, trained with 32 agents, fly flocks of other sizes?",
 }
 STAGES = {
-    "cloning": "cloning of the expert's flights, as in the paper",
+    "cloning": "cloning of the expert's rollouts, as in the paper",
     "dagger": "cloning, then DAgger",
     "mappo": "cloning, DAgger, then MAPPO",
 }
@@ -85,25 +85,25 @@ def _tabled(measurements: Measurements) -> tuple[dict[str, Table], list[Figure],
     tables = {**claim_tables(measurements), **paper_tables(measurements)}
     order = ("claims", "margins", "table1", "table2", "table2_middle", "table3", "comparisons")
     figures = [
-        Figure("validation_error", _by_hops(measurements, VALIDATION), "Error on the expert's flights, m²/s²."),
-        Figure("error_in_flight", _by_hops(measurements, "N32"), "Error on flights of the models' own, m²/s²."),
+        Figure("validation_error", _by_hops(measurements, VALIDATION), "Error on the expert's rollouts, m²/s²."),
+        Figure("error_in_flight", _by_hops(measurements, "N32"), "Error on rollouts of the models' own, m²/s²."),
     ]
     return {name: tables[name] for name in order}, figures, "The figures of the paper stand beside those found here."
 
 
-def _estimate(measurements: Measurements, row: Subject | str, world: str) -> Estimate | None:
-    found = middle(measurements, row, world, "error")
+def _estimate(measurements: Measurements, row: Subject | str, env_config: str) -> Estimate | None:
+    found = middle(measurements, row, env_config, "error")
     return None if found is None or not np.isfinite(found.high) else Estimate(found.value, found.low, found.high)
 
 
-def _by_hops(measurements: Measurements, world: str) -> Callable[[Canvas], None]:
+def _by_hops(measurements: Measurements, env_config: str) -> Callable[[Canvas], None]:
     """Draws a row for each model, a marker for each number of hops (and layers), the references as lines."""
     groups: dict[str, dict[str, Estimate]] = {}
     for subject in measurements.study.subjects:
         layers = "" if subject.layers is None else f"L = {subject.layers}, "
-        if (estimate := _estimate(measurements, subject, world)) is not None:
+        if (estimate := _estimate(measurements, subject, env_config)) is not None:
             groups.setdefault(f"{layers}K = {subject.hops}", {})[name_of(subject.model)] = estimate
-    lines = {name: _estimate(measurements, name, world) for name in REFERENCES[2:]}
+    lines = {name: _estimate(measurements, name, env_config) for name in REFERENCES[2:]}
     references = {name: line.value for name, line in lines.items() if line is not None}
     return functools.partial(_draw_intervals, groups=groups, references=references)
 
@@ -117,12 +117,12 @@ def _studied(measurements: Measurements) -> tuple[dict[str, Table], list[Figure]
     config, study = measurements.config, measurements.study
     name = config.study
     if name in ("communication", "layers"):
-        figures = [Figure(name, _by_hops(measurements, "study-32"), "Error on flights of the models' own, m²/s².")]
-        worlds = {"expert's flights": VALIDATION, "own flights": "study-32"}
+        figures = [Figure(name, _by_hops(measurements, "study-32"), "Error on rollouts of the models' own, m²/s².")]
+        worlds = {"expert's rollouts": VALIDATION, "own rollouts": "study-32"}
     else:
         figures = (_curves_by_fault if name == "faults" else _curves_by_hops)(measurements)
-        worlds = {_heading(world): world.name for world in study.worlds}
-    usual = next(world.name for world in study.worlds if _is_usual(config, world))
+        worlds = {_heading(env_config): env_config.name for env_config in study.worlds}
+    usual = next(env_config.name for env_config in study.worlds if _is_usual(config, env_config))
     tables = {"errors": _errors(measurements, "Errors", worlds, usual)}
     if name == "faults":
         tables = {f"errors_{fault}": table for fault, table in _errors_by_fault(measurements, usual)}
@@ -136,15 +136,15 @@ def _errors_by_fault(measurements: Measurements, usual: str) -> Iterator[tuple[s
         yield next(iter(levels[0][1])), _errors(measurements, f"Errors by {kind}", worlds, usual)
 
 
-def _is_usual(config: ReproduceConfig, world: World) -> bool:
-    same = all(getattr(config.env, name) == value for name, value in world.changes.items())
-    return same and (world.num_agents == REFERENCE_SIZE or config.study != "size")
+def _is_usual(config: ReproduceConfig, env_config: World) -> bool:
+    same = all(getattr(config.env, name) == value for name, value in env_config.changes.items())
+    return same and (env_config.num_agents == REFERENCE_SIZE or config.study != "size")
 
 
-def _heading(world: World) -> str:
-    if world.name.startswith("size-"):
-        return f"N = {world.num_agents}"
-    return ", ".join(f"{name} {value}" for name, value in world.changes.items()) or "as trained"
+def _heading(env_config: World) -> str:
+    if env_config.name.startswith("size-"):
+        return f"N = {env_config.num_agents}"
+    return ", ".join(f"{name} {value}" for name, value in env_config.changes.items()) or "as trained"
 
 
 def _rows(measurements: Measurements) -> list[Subject | str]:
@@ -155,11 +155,13 @@ def _errors(measurements: Measurements, title: str, worlds: Mapping[str, str], u
     rises = len(worlds) > 2
     body: list[list[str | float]] = []
     for row in _rows(measurements):
-        cells: list[str | float] = [shown(middle(measurements, row, world, "error")) for world in worlds.values()]
+        cells: list[str | float] = [
+            shown(middle(measurements, row, env_config, "error")) for env_config in worlds.values()
+        ]
         cells += [_rise(measurements, row, worlds, usual)] if rises else []
         body.append([title_of(row), *cells])
     caption = (
-        "Error against the expert's action, m²/s²: interquartile mean over seeds and flights with its 95 % interval."
+        "Error against the expert's action, m²/s²: interquartile mean over seeds and rollouts with its 95 % interval."
     )
     if rises:
         caption += " Rise: mean over the other worlds, minus the error in the world of training."
@@ -169,23 +171,23 @@ def _errors(measurements: Measurements, title: str, worlds: Mapping[str, str], u
 
 
 def _rise(measurements: Measurements, row: Subject | str, worlds: Mapping[str, str], usual: str) -> float:
-    found = {world: middle(measurements, row, world, "error") for world in {*worlds.values(), usual}}
-    values = {world: np.nan if interval is None else interval.value for world, interval in found.items()}
-    return float(np.mean([value for world, value in values.items() if world != usual]) - values[usual])
+    found = {env_config: middle(measurements, row, env_config, "error") for env_config in {*worlds.values(), usual}}
+    values = {env_config: np.nan if interval is None else interval.value for env_config, interval in found.items()}
+    return float(np.mean([value for env_config, value in values.items() if env_config != usual]) - values[usual])
 
 
 def _flown(measurements: Measurements) -> str:
-    flown = {(world.flocks, world.steps) for world in measurements.study.worlds}
-    flights = sorted({flocks for flocks, _ in flown})
-    span = f"{flights[0]}" if len(flights) == 1 else f"{flights[0]} to {flights[-1]}"
-    return f"{span} flights of {measurements.study.worlds[0].steps} steps from the same starts for all rows."
+    flown = {(env_config.flocks, env_config.steps) for env_config in measurements.study.worlds}
+    rollouts = sorted({flocks for flocks, _ in flown})
+    span = f"{rollouts[0]}" if len(rollouts) == 1 else f"{rollouts[0]} to {rollouts[-1]}"
+    return f"{span} rollouts of {measurements.study.worlds[0].steps} steps from the same starts for all rows."
 
 
 def _lost(measurements: Measurements, worlds: Mapping[str, str]) -> Table:
-    flown = {heading: world for heading, world in worlds.items() if world != VALIDATION}
+    flown = {heading: env_config for heading, env_config in worlds.items() if env_config != VALIDATION}
     body = []
     for row in _rows(measurements):
-        shares = [measurements.values(row, world, "lost") for world in flown.values()]
+        shares = [measurements.values(row, env_config, "lost") for env_config in flown.values()]
         body.append([title_of(row), *("failed" if share is None else f"{share.mean():.0%}" for share in shares)])
     best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(flown)), "low")
     return Table("Share of flocks that lost their leader", ["model", *flown], body, "At the end.", best, REFERENCES)
@@ -213,7 +215,10 @@ def _curves_by_hops(measurements: Measurements) -> list[Figure]:
     """A figure for each K: errors over the communication range, or over the number of agents."""
     study, is_size = measurements.study, measurements.config.study == "size"
     label = "agents" if is_size else "communication range, m"
-    at = [(world.num_agents if is_size else world.changes["comm_range"], world.name) for world in study.worlds]
+    at = [
+        (env_config.num_agents if is_size else env_config.changes["comm_range"], env_config.name)
+        for env_config in study.worlds
+    ]
     marks = {"trained": float(REFERENCE_SIZE) if is_size else measurements.config.env.comm_range}
     return [
         Figure(
@@ -226,7 +231,7 @@ def _curves_by_hops(measurements: Measurements) -> list[Figure]:
                 marks=marks,
                 log_x=is_size,
             ),
-            f"Error on flights of the models' own over {label}, K = {hops}; bands are 95 % intervals.",
+            f"Error on rollouts of the models' own over {label}, K = {hops}; bands are 95 % intervals.",
         )
         for hops in HOPS
     ]
@@ -238,7 +243,7 @@ def _curves_by_fault(measurements: Measurements) -> list[Figure]:
     for kind, levels in FAULTS.items():
         at = [(0.0, "study-32"), *((level, fault_name(change)) for level, change in levels)]
         draw = functools.partial(draw_curves, curves=_curves(measurements, 1, at), x_label=kind, y_label="error, m²/s²")
-        caption = f"Error on flights of the models' own over {kind}, K = 1; bands are 95 % intervals."
+        caption = f"Error on rollouts of the models' own over {kind}, K = 1; bands are 95 % intervals."
         figures.append(Figure(f"faults_{next(iter(levels[0][1]))}", draw, caption))
     return figures
 
@@ -250,7 +255,7 @@ def _curves(measurements: Measurements, hops: int, at: Sequence[tuple[float, str
     rows |= {"LocalReynolds": "LocalReynolds(hops=1)", "zero action": "zero action"}
     curves, unknown = {}, Estimate(np.nan, np.nan, np.nan)
     for name, row in rows.items():
-        found = [_estimate(measurements, row, world) or unknown for _, world in at]
+        found = [_estimate(measurements, row, env_config) or unknown for _, env_config in at]
         value, low, high = ([getattr(one, end) for one in found] for end in ("value", "low", "high"))
         curves[name] = Curve([level for level, _ in at], value, low, high)
     return curves

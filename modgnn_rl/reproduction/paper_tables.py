@@ -56,9 +56,9 @@ def name_of(model: str) -> str:
     return NAMES.get(model, model)
 
 
-def middle(measurements: Measurements, row: Row, world: str, figure: str) -> Interval | None:
-    """Interquartile mean of a figure over seeds and flights, with its 95 % interval; None where all failed."""
-    values = measurements.values(row, world, figure)
+def middle(measurements: Measurements, row: Row, env_config: str, figure: str) -> Interval | None:
+    """Interquartile mean of a figure over seeds and rollouts, with its 95 % interval; None where all failed."""
+    values = measurements.values(row, env_config, figure)
     return None if values is None else interquartile_interval(values, rng=np.random.default_rng(0))
 
 
@@ -81,22 +81,24 @@ def paper_tables(measurements: Measurements) -> dict[str, Table]:
     }
 
 
-def mean(measurements: Measurements, row: Row, world: str, figure: str) -> float:
-    """Mean of a figure over seeds and flights; NaN where all failed."""
-    values = measurements.values(row, world, figure)
+def mean(measurements: Measurements, row: Row, env_config: str, figure: str) -> float:
+    """Mean of a figure over seeds and rollouts; NaN where all failed."""
+    values = measurements.values(row, env_config, figure)
     return math.nan if values is None else float(values.mean())
 
 
-def _about(measurements: Measurements, world: str) -> str:
-    """How many flights a table rests on."""
+def _about(measurements: Measurements, env_config: str) -> str:
+    """How many rollouts a table rests on."""
     seeds = measurements.config.seeds
     counted = (
-        f"{seeds} trainings of each model" if seeds > 1 else "one training of each model, so intervals tell of flights"
+        f"{seeds} trainings of each model" if seeds > 1 else "one training of each model, so intervals tell of rollouts"
     )
-    if world == VALIDATION:
-        return f"{measurements.config.scale.held_out} flights of the expert that no model was trained on; {counted}."
-    flown = next(entry for entry in measurements.study.worlds if entry.name == world)
-    return f"{flown.flocks} flights of {flown.steps} steps, from the same starts for all rows; {counted}."
+    if env_config == VALIDATION:
+        return (
+            f"{measurements.config.scale.val_episodes} rollouts of the expert that no model was trained on; {counted}."
+        )
+    flown = next(entry for entry in measurements.study.worlds if entry.name == env_config)
+    return f"{flown.flocks} rollouts of {flown.steps} steps, from the same starts for all rows; {counted}."
 
 
 def _paper(row: Row, *keys: Any) -> Any:
@@ -122,7 +124,7 @@ def _validation(measurements: Measurements, rows: Sequence[Row]) -> Table:
         body.append([title_of(row), math.nan if paper is None else paper, average, shown(here)])
     caption = (
         "Mean squared error against the expert's action, per component, m²/s², while the expert flies. Middle: "
-        f"interquartile mean with its 95 % interval over seeds and flights. {_about(measurements, VALIDATION)}"
+        f"interquartile mean with its 95 % interval over seeds and rollouts. {_about(measurements, VALIDATION)}"
     )
     header = ["model", "paper", "mean", "middle [95 %]"]
     return Table("Table 1: validation error", header, body, caption, {1: "low", 2: "low"}, REFERENCES)
@@ -142,16 +144,17 @@ def _evaluation(measurements: Measurements, rows: Sequence[Row]) -> Table:
             cells += ["-" if there is None else f"{there[0]:.2f} ± {there[1]:.2f}", _spread(measurements, row, figure)]
         body.append([*cells, _share(measurements, row, "lost")])
     caption = (
-        "Flights of the models' own with 32 agents. Error: mean squared, against the expert's action, m²/s². Leader "
-        "distance, cohesion and separation: mean ± standard deviation over time, agents and flights, m. Lost: share of "
+        "Rollouts of the models' own with 32 agents. Error: mean squared, against the expert's action, m²/s². Leader "
+        "distance, cohesion and separation: mean ± standard deviation over time, agents and rollouts, m. Lost: "
+        "share of "
         f"flocks in which nobody hears the leader at the end. {_about(measurements, 'N32')}"
     )
     best: dict[int, Any] = {1: "low", 2: "low", 3: "low", 4: "low", 5: "low", 6: "low"}
-    return Table("Table 2: flights of the models' own", [*header, "lost"], body, caption, best, REFERENCES)
+    return Table("Table 2: rollouts of the models' own", [*header, "lost"], body, caption, best, REFERENCES)
 
 
 def spread(measurements: Measurements, row: Row, figure: str) -> tuple[float, float]:
-    """Mean and standard deviation of a figure over time, agents, flights and seeds; NaN where all failed."""
+    """Mean and standard deviation of a figure over time, agents, rollouts and seeds; NaN where all failed."""
     values, squares = (measurements.values(row, "N32", name) for name in (figure, f"{figure}_square"))
     if values is None or squares is None:
         return math.nan, math.nan
@@ -178,31 +181,32 @@ def _evaluation_middle(measurements: Measurements, rows: Sequence[Row]) -> Table
         for row in rows
     ]
     caption = (
-        "The same flights: interquartile means over seeds and flights with their 95 % intervals. Spread of separation: "
-        "its standard deviation over the time and agents of a flight, m. Reward: of an agent, summed over the flight."
+        "The same rollouts: interquartile means over seeds and rollouts with their 95 % intervals. Spread of "
+        "separation: "
+        "its standard deviation over the time and agents of a rollout, m. Reward: of an agent, summed over the rollout."
     )
     best: dict[int, Any] = {1: "low", 2: "low", 3: "low", 5: "low", 6: "high"}
-    return Table("Table 2, middle of the flights", ["model", *figures.values()], body, caption, best, REFERENCES)
+    return Table("Table 2, middle of the rollouts", ["model", *figures.values()], body, caption, best, REFERENCES)
 
 
 def _generalization(measurements: Measurements, rows: Sequence[Row]) -> Table:
-    worlds = [world for world in measurements.study.worlds if not world.changes]
+    worlds = [env_config for env_config in measurements.study.worlds if not env_config.changes]
     header, body = ["model"], []
-    for world in worlds:
-        header += [f"N = {world.num_agents}, paper", f"N = {world.num_agents}", "middle [95 %]"]
+    for env_config in worlds:
+        header += [f"N = {env_config.num_agents}, paper", f"N = {env_config.num_agents}", "middle [95 %]"]
     for row in rows:
         model, hops = _hops(row)
         if model == "central":
             continue
         cells: list[Any] = [title_of(row)]
-        for world in worlds:
-            paper = _paper(row, "generalization", model, hops, world.num_agents)
-            average = mean(measurements, row, world.name, "error")
-            here = middle(measurements, row, world.name, "error")
+        for env_config in worlds:
+            paper = _paper(row, "generalization", model, hops, env_config.num_agents)
+            average = mean(measurements, row, env_config.name, "error")
+            here = middle(measurements, row, env_config.name, "error")
             cells += [math.nan if paper is None else paper, average, shown(here)]
         body.append(cells)
     caption = (
-        "Error on flights of the models' own with other numbers of agents than the 32 of training: mean, and "
+        "Error on rollouts of the models' own with other numbers of agents than the 32 of training: mean, and "
         f"interquartile mean with its 95 % interval. {_about(measurements, worlds[0].name)}"
     )
     best: dict[int, Any] = {

@@ -1,4 +1,4 @@
-"""A study in cells: the expert's flights, models trained on them, and what is measured of these."""
+"""A study in cells: the expert's rollouts, models trained on them, and what is measured of these."""
 
 from __future__ import annotations
 
@@ -31,15 +31,17 @@ __all__ = ["cells_of"]
 
 
 def cells_of(config: ReproduceConfig, study: Study, folder: Path) -> list[Cell]:
-    """What a study takes: a dataset, trainings, flights of the references and of all policies in all worlds."""
+    """What a study takes: a dataset, trainings, rollouts of the references and of all policies in all worlds."""
     scale = config.scale
     cost = scale.episodes * scale.steps * 1e-4
     is_there = functools.partial(_is_dataset_there, folder)
     cells = [Cell("dataset", functools.partial(_collect, config, folder), cost, is_there=is_there)]
-    flights = []
-    for world in study.worlds:
-        cost = 4 * _flight_cost(world)
-        flights.append(Cell(f"references-{world.name}", functools.partial(fly_references, config, world), cost))
+    rollouts = []
+    for env_config in study.worlds:
+        cost = 4 * _flight_cost(env_config)
+        rollouts.append(
+            Cell(f"references-{env_config.name}", functools.partial(fly_references, config, env_config), cost)
+        )
     cells.append(Cell(f"references-{VALIDATION}", functools.partial(look_on, config, folder), 1.0, ("dataset",)))
     for seed in range(config.seeds):
         for group in _groups(study):
@@ -48,20 +50,25 @@ def cells_of(config: ReproduceConfig, study: Study, folder: Path) -> list[Cell]:
                 cells += _stages_after(config, study, subject, seed, folder)
                 needs = (_policy_cell(config.after, study, subject, seed),)
                 look = functools.partial(validate, config, folder, subject)
-                flights.append(
+                rollouts.append(
                     Cell(flight_cell(config, subject, seed, study, VALIDATION), look, 1.0, (*needs, "dataset"))
                 )
-                for world in filter(functools.partial(study.flies, subject), study.worlds):
-                    work = functools.partial(fly_subject, config, folder, subject, world)
-                    flights.append(
-                        Cell(flight_cell(config, subject, seed, study, world.name), work, _flight_cost(world), needs)
+                for env_config in filter(functools.partial(study.flies, subject), study.worlds):
+                    work = functools.partial(fly_subject, config, folder, subject, env_config)
+                    rollouts.append(
+                        Cell(
+                            flight_cell(config, subject, seed, study, env_config.name),
+                            work,
+                            _flight_cost(env_config),
+                            needs,
+                        )
                     )
-    return cells + flights
+    return cells + rollouts
 
 
-def _flight_cost(world: World) -> float:
-    """Seconds, roughly: a flight, a step and a pair of agents have costs of their own."""
-    return 0.5 + world.steps * (0.015 + world.flocks * 5e-4 * (world.num_agents / 32) ** 1.7)
+def _flight_cost(env_config: World) -> float:
+    """Seconds, roughly: a rollout, a step and a pair of agents have costs of their own."""
+    return 0.5 + env_config.steps * (0.015 + env_config.flocks * 5e-4 * (env_config.num_agents / 32) ** 1.7)
 
 
 def _groups(study: Study) -> list[list[Subject]]:
@@ -87,8 +94,8 @@ def _cloning_cell(config: ReproduceConfig, study: Study, group: list[Subject], s
     trainer = BCConfig(
         hops=[subject.hops for subject in group],
         dataset=str(folder / "dataset"),
-        held_out=scale.held_out,
-        cloning_steps=4,  # of the flights that it looks at while it trains
+        num_val_envs=scale.val_episodes,
+        cloning_steps=4,  # of the rollouts that it looks at while it trains
         cloning_updates=study.updates,
         batch_size=scale.batch_size,
         rotate=False,  # the paper did not
@@ -108,7 +115,7 @@ def _stages_after(config: ReproduceConfig, study: Study, subject: Subject, seed:
     """DAgger from the cloned policy, and MAPPO from that, as far as asked for."""
     scale = config.scale
     dagger = DAggerConfig(
-        rounds=scale.rounds,
+        rounds=scale.dagger_rounds,
         num_envs=scale.num_envs,
         cloning_steps=min(200, scale.steps),
         cloning_updates=0,
@@ -116,14 +123,14 @@ def _stages_after(config: ReproduceConfig, study: Study, subject: Subject, seed:
         rotate=False,
     )
     mappo = MAPPOConfig(
-        iterations=scale.iterations,
+        rounds=scale.mappo_rounds,
         num_envs=scale.num_envs,
-        critic_warmup=min(10, scale.iterations // 4),
-        anchor_rounds=min(50, scale.iterations // 2),
+        critic_warmup=min(10, scale.mappo_rounds // 4),
+        kl_rounds=min(50, scale.mappo_rounds // 2),
     )
     stages: list[tuple[str, DAggerConfig | MAPPOConfig, float]] = [
-        ("dagger", dagger, 2.0 * scale.rounds),
-        ("mappo", mappo, 5.0 * scale.iterations),
+        ("dagger", dagger, 2.0 * scale.dagger_rounds),
+        ("mappo", mappo, 5.0 * scale.mappo_rounds),
     ]
     before, cells = "cloning", []
     for stage, trainer, cost in stages[: ("cloning", "dagger", "mappo").index(config.after)]:
@@ -148,7 +155,7 @@ def _training(config: ReproduceConfig, folder: Path, name: str, seed: int) -> Tr
     """What all trainings share; equal seeds draw equal batches, whatever the model."""
     return TrainConfig(
         env=config.env,
-        evaluation=EvaluationConfig(num_flocks=2, steps=4),  # flights are cells of their own
+        evaluation=EvaluationConfig(num_flocks=2, steps=4),  # rollouts are cells of their own
         seed=derive_seed(config.seed, "seed", seed),
         device=config.device,
         threads=config.threads,
@@ -163,17 +170,17 @@ def _is_dataset_there(folder: Path, result: Result) -> bool:
 
 def _collect(config: ReproduceConfig, folder: Path, done: Mapping[str, Result]) -> Result:
     scale = config.scale
-    flights = CollectConfig(
+    rollouts = CollectConfig(
         env=config.env,
-        episodes=scale.episodes + scale.held_out,
+        episodes=scale.episodes + scale.val_episodes,
         steps=scale.steps,
         seed=derive_seed(config.seed, "dataset"),
         output=str(folder / "dataset"),
         device=config.device,
         threads=config.threads,
     )
-    collect(flights)
-    return {"episodes": flights.episodes}
+    collect(rollouts)
+    return {"episodes": rollouts.episodes}
 
 
 def _train(config: TrainConfig, group: Sequence[Subject], folder: Path, done: Mapping[str, Result]) -> Result:

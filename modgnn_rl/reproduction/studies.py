@@ -71,9 +71,9 @@ class Study:
     worlds: Sequence[World]
     updates: int
 
-    def flies(self, subject: Subject, world: World) -> bool:
+    def flies(self, subject: Subject, env_config: World) -> bool:
         """Whether a model can serve a world; Central serves one number of agents."""
-        return subject.model != "central" or world.num_agents == 32
+        return subject.model != "central" or env_config.num_agents == 32
 
 
 def study_of(config: ReproduceConfig) -> Study:
@@ -81,7 +81,7 @@ def study_of(config: ReproduceConfig) -> Study:
     scale = config.scale
     every = [Subject(model, hops) for model in GNNS for hops in HOPS]
     further = [Subject(model, hops) for model in as_list(config.models or []) for hops in as_list(config.hops)]
-    usual = World("study-32", REFERENCE_SIZE, scale.study_flocks, scale.study_steps)
+    usual = World("study-32", REFERENCE_SIZE, scale.study_episodes, scale.study_steps)
     if config.study == "communication":
         kinds = [Subject(model, hops) for model in KINDS for hops in (1, 2)]
         return Study("communication", kinds, [usual], scale.study_updates)
@@ -93,7 +93,7 @@ def study_of(config: ReproduceConfig) -> Study:
         ]
         return Study("layers", shapes, [usual], scale.study_updates)
     if config.study == "tables":
-        worlds = [World(f"N{size}", size, scale.flocks, scale.flight_steps) for size in scale.sizes]
+        worlds = [World(f"N{size}", size, scale.eval_episodes, scale.eval_steps) for size in scale.sizes]
         subjects = dict.fromkeys([*every, Subject("central", 1), *further])
         return Study("tables", list(subjects), worlds, scale.updates)
     worlds = {"range": _ranges, "faults": _faulty, "size": _sizes}[config.study](scale)
@@ -101,12 +101,12 @@ def study_of(config: ReproduceConfig) -> Study:
 
 
 def _ranges(scale: ScaleConfig) -> list[World]:
-    flown = (REFERENCE_SIZE, scale.study_flocks, scale.study_steps)
+    flown = (REFERENCE_SIZE, scale.study_episodes, scale.study_steps)
     return [World(f"range-{reach}", *flown, {"comm_range": reach}) for reach in RANGES]
 
 
 def _faulty(scale: ScaleConfig) -> list[World]:
-    flown = (REFERENCE_SIZE, scale.study_flocks, scale.study_steps)
+    flown = (REFERENCE_SIZE, scale.study_episodes, scale.study_steps)
     changes = [change for levels in FAULTS.values() for _, change in levels]
     return [World("study-32", *flown), *(World(fault_name(change), *flown, change) for change in changes)]
 
@@ -120,7 +120,7 @@ def fault_name(change: Mapping[str, Any]) -> str:
 def _sizes(scale: ScaleConfig) -> list[World]:
     """Flocks of more agents are fewer, so that about as many agents fly."""
     return [
-        World(f"size-{size}", size, max(2, scale.study_flocks * min(REFERENCE_SIZE, size) // size), scale.study_steps)
+        World(f"size-{size}", size, max(2, scale.study_episodes * min(REFERENCE_SIZE, size) // size), scale.study_steps)
         for size in scale.study_sizes
     ]
 

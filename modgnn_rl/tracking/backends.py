@@ -1,6 +1,6 @@
-"""Dashboards: what TensorBoard, Weights & Biases and CSV files each make of a run, on TorchRL's loggers.
+"""LoggerGroup: what TensorBoard, Weights & Biases and CSV files each make of a run, on TorchRL's loggers.
 
-They may fail and may keep one waiting; `modgnn_rl.tracking.loggers.Dashboards` guards against both.
+They may fail and may keep one waiting; `modgnn_rl.tracking.loggers.LoggerGroup` guards against both.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ def _evaluation(runs: Sequence[RunSummary]) -> list[list[str]]:
     for flock in dict.fromkeys(flock for run in runs for flock in run.evaluations):
         found = [run.evaluations.get(flock) for run in runs]
         rows.append(
-            [flock, *(f"{row['num_flocks']} flights of {row['steps']} steps" if row else MISSING for row in found)]
+            [flock, *(f"{row['num_flocks']} rollouts of {row['steps']} steps" if row else MISSING for row in found)]
         )
         rows += [[_title(metric), *(_interval(row and row[metric]) for row in found)] for metric in EVALUATED]
         rows += [[share, *(f"{row[share]:.0%}" if row else MISSING for row in found)] for share in SHARES]

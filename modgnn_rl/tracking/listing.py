@@ -18,7 +18,8 @@ LABELS = {"validation_loss": "loss"}
 LESS_IMPORTANT = ("speed", "age", "took", "leader", "best")  # columns that go where there is no room, in this order
 SHORTEST_NAME = 24
 LEGEND = (
-    "took: time trained; last: error of the actions on own flights (m^2/s^2), loss on held-out flights, or reward of a "
+    "took: time trained; last: error of the actions on own rollouts (m^2/s^2), loss on held-out rollouts, or "
+    "reward of a "
     "step, in the last round; best: its best mean over 5 rounds; eval.: error in the evaluation; leader: distance from "
     "the leader there, m"
 )
@@ -124,7 +125,7 @@ def _last_figure(run: RunSummary) -> str:
 
 
 def _evaluated(run: RunSummary, metric: str) -> float | None:
-    """The mean of a metric in flights of the size and in the world trained on; of another size if there are none."""
+    """The mean of a metric in rollouts of the size and in the world trained on; of another size if there are none."""
     tables = [table for size in run.sizes if (table := run.evaluations.get(f"{size} agents"))]
     tables += [table for name, table in run.evaluations.items() if "," not in name]
     spread = tables[0][metric] if tables else None

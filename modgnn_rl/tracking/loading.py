@@ -18,7 +18,7 @@ from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 
-__all__ = ["changed_world", "load_policy", "stored_model", "stored_world"]
+__all__ = ["load_env_config", "load_policy", "override_env_config", "stored_model"]
 
 
 def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", which: str = "last") -> ModGNN:
@@ -37,7 +37,7 @@ def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = 
     """
     run = RunFolder.open(Path(folder))
     model = stored_model(run)
-    policy = configured_model(model, stored_world(run), seed=0)
+    policy = configured_model(model, load_env_config(run), seed=0)
     checkpoint = load_checkpoint(run.best if which == "best" else run.checkpoints, groups=("policy",))
     try:
         policy.load_state_dict(checkpoint.tensors["policy"])
@@ -59,22 +59,22 @@ def stored_model(run: RunFolder) -> ModelConfig:
     return model
 
 
-def stored_world(run: RunFolder) -> FlockingConfig:
+def load_env_config(run: RunFolder) -> FlockingConfig:
     """The world that a run was trained in.
 
     Raises:
         InputError: its configuration does not describe one.
     """
-    world: FlockingConfig = _stored(run, "env", FlockingConfig)
-    return world
+    env_config: FlockingConfig = _stored(run, "env", FlockingConfig)
+    return env_config
 
 
-def changed_world(run: RunFolder, changes: Any) -> tuple[FlockingConfig, dict[str, Any]]:
+def override_env_config(run: RunFolder, changes: Any) -> tuple[FlockingConfig, dict[str, Any]]:
     """The world that a run was trained in, with some settings changed.
 
     Args:
         run: the run.
-        changes: a `modgnn_rl.configs.schema.WorldChanges`.
+        changes: a `modgnn_rl.configs.schema.EnvOverrides`.
 
     Returns:
         the world, and by name the settings that are changed.
@@ -84,10 +84,10 @@ def changed_world(run: RunFolder, changes: Any) -> tuple[FlockingConfig, dict[st
     """
     changed = {name: value for name, value in vars(changes).items() if value is not None}
     try:
-        world: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(stored_world(run)), changed))
+        env_config: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(load_env_config(run)), changed))
     except OmegaConfBaseException as error:
         raise InputError(f"env.{error.full_key}: {str(error.msg).splitlines()[0]}") from error
-    return world, changed
+    return env_config, changed
 
 
 def _stored(run: RunFolder, group: str, schema: type) -> Any:

@@ -19,13 +19,13 @@ from modgnn_rl.tracking.backends import CsvFiles, Dashboard, Tensorboard, Wandb
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.provenance import made_with
 
-__all__ = ["Dashboards", "check_logger", "make_logger"]
+__all__ = ["LoggerGroup", "check_logger", "make_logger"]
 
 PATIENCE = 13.0  # s; a dashboard that takes longer over anything is turned off
 
 
-class Dashboards:
-    """Dashboards of which each is turned off by its first exception, or its first long wait, with one warning.
+class LoggerGroup:
+    """LoggerGroup of which each is turned off by its first exception, or its first long wait, with one warning.
 
     None of the methods raises, and the other dashboards go on.
 
@@ -114,7 +114,7 @@ def check_logger(config: TrainConfig) -> None:
         raise InputError("logger=tensorboard needs a package that is not installed: pip install tensorboard")
 
 
-def make_logger(config: TrainConfig, run: RunFolder) -> Dashboards:
+def make_logger(config: TrainConfig, run: RunFolder) -> LoggerGroup:
     """Make the dashboards that a run asks for, with their files inside the run folder.
 
     They show all settings and what the run was made with from the start on.
@@ -130,7 +130,7 @@ def make_logger(config: TrainConfig, run: RunFolder) -> Dashboards:
         "tensorboard": lambda: Tensorboard(run, about),
         "wandb": lambda: Wandb(run, about, config.wandb),
     }
-    return Dashboards({name: builders[name] for name in names})
+    return LoggerGroup({name: builders[name] for name in names})
 
 
 def _within(seconds: float, action: Callable[[], Any]) -> Any:

@@ -55,7 +55,7 @@ class RunSummary:
         aim: the metric that the best policy is the best in.
         best: its value then, a mean over 5 rounds.
         evaluations: the policy's row of each evaluation table, by the number of agents and the changes of the world, as
-            in ``32 agents, wind=1``: `EVALUATED` with mean and confidence interval, `SHARES`, and of how many flights
+            in ``32 agents, wind=1``: `EVALUATED` with mean and confidence interval, `SHARES`, and of how many rollouts
             and steps (``num_flocks``, ``steps``) they are.
         policies: each of several policies.
     """

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-__all__ = ["Interruption", "Stopped"]
+__all__ = ["GracefulInterrupt", "Stopped"]
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -26,12 +26,12 @@ class Stopped(KeyboardInterrupt):
         self.code = 128 + number
 
 
-class Interruption:
+class GracefulInterrupt:
     """Turns signals into a question that long work asks itself now and then.
 
     Example::
 
-        with Interruption().listen() as interruption:
+        with GracefulInterrupt().listen() as interruption:
             with interruption.deferred():
                 for step in range(1000):
                     ...  # is not torn apart
@@ -47,7 +47,7 @@ class Interruption:
         self._advice = ""
 
     @contextlib.contextmanager
-    def listen(self) -> Iterator[Interruption]:
+    def listen(self) -> Iterator[GracefulInterrupt]:
         """Take over the signals; they are given back at the end."""
         if threading.current_thread() is not threading.main_thread():
             yield self

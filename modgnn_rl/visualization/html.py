@@ -1,4 +1,4 @@
-"""Recordings of a flight as one HTML file that plays them, without a network and without anything installed.
+"""Recordings of a rollout as one HTML file that plays them, without a network and without anything installed.
 
 The page, ``replay.html``, holds each recording as a gzip stream in base64. Numbers change little from step to step:
 kept are the second differences of positions and the first ones of velocities, zigzag coded (0, -1, 1, -2, ... as 0, 1,
@@ -31,27 +31,27 @@ VELOCITY_STEPS = 127  # from zero to the largest speed
 
 
 def write_replay(
-    path: str | os.PathLike[str], flights: Mapping[str, Recording], title: str, facts: Mapping[str, Any] | None = None
+    path: str | os.PathLike[str], rollouts: Mapping[str, Recording], title: str, facts: Mapping[str, Any] | None = None
 ) -> None:
-    """Write recordings of one flight, flown by several, as a page, whole or not at all.
+    """Write recordings of one rollout, flown by several, as a page, whole or not at all.
 
     Args:
         path: the file; its folder must exist.
-        flights: recordings of equal length and size, by the name of who flies; the first two are shown at first.
+        rollouts: recordings of equal length and size, by the name of who flies; the first two are shown at first.
         title: heading of the page.
-        facts: what else is to be said of the flight, by name.
+        facts: what else is to be said of the rollout, by name.
     """
-    write_atomically(path, replay_page(flights, title, facts or {}))
+    write_atomically(path, replay_page(rollouts, title, facts or {}))
 
 
-def replay_page(flights: Mapping[str, Recording], title: str, facts: Mapping[str, Any]) -> str:
+def replay_page(rollouts: Mapping[str, Recording], title: str, facts: Mapping[str, Any]) -> str:
     """The page that `write_replay` writes."""
-    first = next(iter(flights.values()))
+    first = next(iter(rollouts.values()))
     steps, agents = first.present.shape
     content = {
         "agents": agents,
         "frames": steps,
-        "every": first.every,
+        "stride": first.stride,
         "frequency": first.frequency,
         "range": first.comm_range if np.isfinite(first.comm_range) else None,
         "quantum": QUANTUM,
@@ -59,8 +59,8 @@ def replay_page(flights: Mapping[str, Recording], title: str, facts: Mapping[str
         "velocity_steps": VELOCITY_STEPS,
         "metrics": [[name, *words] for name, words in METRICS.items()],
         "facts": {name: str(value) for name, value in facts.items()},
-        "flights": [
-            {"name": name, "data": base64.b64encode(pack(recording)).decode()} for name, recording in flights.items()
+        "rollouts": [
+            {"name": name, "data": base64.b64encode(pack(recording)).decode()} for name, recording in rollouts.items()
         ],
     }
     # Inside a script element only "<" could end the JSON.

@@ -1,4 +1,4 @@
-"""A still picture of recorded flights, for papers: agents, links, target velocities, trails, the leader as a star."""
+"""A still picture of recorded rollouts, for papers: agents, links, target velocities, trails, the leader as a star."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ MOST_LINKS = 3000  # the shortest are drawn
 COLOURS = {"agent": "#172033", "leader": "#d01f2e", "link": "#d9a400", "target": "#1b62d0", "trail": "#9aa5ba"}
 
 
-def write_picture(path: str | os.PathLike[str], flights: Mapping[str, Recording], step: int) -> None:
-    """Draw flights at one step, side by side and of one scale, and write the picture, whole or not at all.
+def write_picture(path: str | os.PathLike[str], rollouts: Mapping[str, Recording], step: int) -> None:
+    """Draw rollouts at one step, side by side and of one scale, and write the picture, whole or not at all.
 
     Args:
         path: the file, whose name ends in ``.svg``, ``.png`` or another that matplotlib writes; its folder must exist.
-        flights: recordings by the name of who flies.
+        rollouts: recordings by the name of who flies.
         step: index of the step among those that were kept.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    # Text stays text, and the same flight gives the same file.
+    # Text stays text, and the same rollout gives the same file.
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "modgnn_rl", "font.family": "sans-serif"}):
-        figure = Figure(figsize=(PANEL * len(flights), PANEL * 1.04), facecolor="white")
+        figure = Figure(figsize=(PANEL * len(rollouts), PANEL * 1.04), facecolor="white")
         FigureCanvasAgg(figure)
         figure.subplots_adjust(0.01, 0.01, 0.99, 0.93, 0.03)
         drawn = []
-        for column, (name, flight) in enumerate(flights.items()):
-            axes = figure.add_subplot(1, len(flights), column + 1)
+        for column, (name, rollout) in enumerate(rollouts.items()):
+            axes = figure.add_subplot(1, len(rollouts), column + 1)
             axes.set_axis_off()
             axes.set_aspect("equal")
             axes.set_title(
-                f"{name}, {step * flight.every / flight.frequency:.1f} s", fontsize=11, color=COLOURS["agent"]
+                f"{name}, {step * rollout.stride / rollout.frequency:.1f} s", fontsize=11, color=COLOURS["agent"]
             )
-            drawn.append((axes, _draw(axes, flight, step)))
+            drawn.append((axes, _draw(axes, rollout, step)))
         reach = 1.04 * max(float(reach) for _, reach in drawn)
         for axes, _ in drawn:
             axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
@@ -60,19 +60,19 @@ def write_picture(path: str | os.PathLike[str], flights: Mapping[str, Recording]
     write_atomically(path, file.getvalue())
 
 
-def _draw(axes: Any, flight: Recording, step: int) -> float:
+def _draw(axes: Any, rollout: Recording, step: int) -> float:
     """Draw one flock about its centre; return the distance from there to the farthest thing drawn, m."""
-    seconds = flight.every / flight.frequency
+    seconds = rollout.stride / rollout.frequency
     begin = max(0, step - round(TRAIL / seconds))
-    metres = flight.position[begin : step + 1].astype(np.float64) * QUANTUM
+    metres = rollout.position[begin : step + 1].astype(np.float64) * QUANTUM
     centre = metres[-1].mean(0)
     axis_x = np.array((-np.sin(YAW), np.cos(YAW), 0.0))
     axis_y = np.array((-np.sin(PITCH) * np.cos(YAW), -np.sin(PITCH) * np.sin(YAW), np.cos(PITCH)))
     plane = np.stack((axis_x, axis_y), 1)
     paths = (metres - centre) @ plane  # [T, N, 2]
-    spots, tips = paths[-1], flight.target_velocity[step].astype(np.float64) @ plane
+    spots, tips = paths[-1], rollout.target_velocity[step].astype(np.float64) @ plane
     spots3 = metres[-1]
-    links = flight.links(step)
+    links = rollout.links(step)
     agents = len(spots)
     receiver, sender = links // agents, links % agents
     pairs = np.unique(np.sort(np.stack((receiver, sender), 1), 1), axis=0)

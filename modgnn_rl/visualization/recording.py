@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking.recording import Recorder, Recording
-from modgnn_rl.evaluation.rollout import fly
+from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.utils.progress import Progress
 
 __all__ = ["record"]
@@ -17,12 +17,12 @@ __all__ = ["record"]
 
 def record(
     policy: TensorDictModuleBase,
-    world: FlockingConfig,
+    env_config: FlockingConfig,
     *,
     num_agents: int,
     steps: int,
     seed: int,
-    every: int = 1,
+    stride: int = 1,
     device: str = "cpu",
     progress: Progress | None = None,
     watch: Callable[[TensorDictBase], None] | None = None,
@@ -31,27 +31,27 @@ def record(
     """Fly one flock with a policy and keep what it looks like, for `modgnn_rl.visualization.html.write_replay`.
 
     Args:
-        policy: as `modgnn_rl.evaluation.rollout.fly` flies it.
-        world: the world.
+        policy: as `modgnn_rl.evaluation.rollout.rollout` flies it.
+        env_config: the world.
         num_agents: agents in the flock.
-        steps: steps of the flight, which goes on whatever happens to the flock.
+        steps: steps of the rollout, which goes on whatever happens to the flock.
         seed: seed of start and leader.
-        every: of the steps flown, each how-manyth is kept.
+        stride: of the steps flown, each how-manyth is kept.
         device: where to fly.
         progress: counts steps.
         watch: is shown the flock before each step, too.
         expert: what errors are measured against; default: Reynolds flocking.
     """
-    recorder = Recorder(world, every)
+    recorder = Recorder(env_config, stride)
 
     def look(tensordict: TensorDictBase) -> None:
         recorder(tensordict)
         if watch is not None:
             watch(tensordict)
 
-    fly(
+    rollout(
         policy,
-        world,
+        env_config,
         num_agents=num_agents,
         num_flocks=1,
         steps=steps,

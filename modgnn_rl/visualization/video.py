@@ -19,7 +19,7 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation.rollout import endless_env
+from modgnn_rl.evaluation.rollout import make_eval_env
 from modgnn_rl.nn.topology import as_matrix
 
 __all__ = ["Frame", "as_gif", "check_video", "film", "write_video"]
@@ -77,11 +77,11 @@ def film(
         policy: reads the environment's keys, writes ``("agents", "action")``; its recurrent state is added by itself.
         config: the world.
         num_agents: agents in the flock.
-        steps: steps of the flight, which goes on whatever happens to the flock.
+        steps: steps of the rollout, which goes on whatever happens to the flock.
         seed: seed of start and leader.
         device: where to fly.
     """
-    env = endless_env(policy, config, 1, num_agents, steps=steps, seed=seed, device=device)
+    env = make_eval_env(policy, config, 1, num_agents, steps=steps, seed=seed, device=device)
     frames = []
     with contextlib.closing(env), set_recurrent_mode(False):
         tensordict = env.reset()

@@ -1,4 +1,4 @@
-"""A flight watched in a browser while it is flown, on this machine alone; needs ``modgnn-rl[viewer]``."""
+"""A rollout watched in a browser while it is flown, on this machine alone; needs ``modgnn-rl[viewer]``."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from modgnn_rl.nn.topology import as_matrix
 __all__ = ["Viewer"]
 
 HOST = "127.0.0.1"
-PATIENCE = 30.0  # s to wait for a browser before the flight begins without one
+PATIENCE = 30.0  # s to wait for a browser before the rollout begins without one
 MOST_LINKS = 3000  # the shortest are drawn
 PICTURES = 24.0  # a second at most
 COLOURS = {"agent": (23, 32, 51), "leader": (208, 31, 46), "link": (227, 181, 5), "target": (27, 98, 208)}
 
 
 class Viewer:
-    """Shows the first flock that `modgnn_rl.evaluation.rollout.fly` shows it, at the pace of its clock or slower.
+    """Shows the first flock that `modgnn_rl.evaluation.rollout.rollout` shows it, at the pace of its clock or slower.
 
     Args:
         config: the world.
         port: where a browser finds it, on this machine.
-        patience: longest wait for a browser before the flight begins, s.
+        patience: longest wait for a browser before the rollout begins, s.
 
     Raises:
         InputError: viser is not installed, or the port is taken.
@@ -62,7 +62,7 @@ class Viewer:
     def __enter__(self) -> Self:
         """Say where to look, and wait a while for somebody to do so."""
         print(
-            f"Watch at {self.url}; the flight begins when a browser is there, or in {self.patience:.0f} s", flush=True
+            f"Watch at {self.url}; the rollout begins when a browser is there, or in {self.patience:.0f} s", flush=True
         )
         end = time.monotonic() + self.patience
         while not self.server.get_clients() and time.monotonic() < end:
@@ -80,7 +80,7 @@ class Viewer:
         if (early := due - time.monotonic()) > 0:
             time.sleep(early)
         else:
-            self.begun -= early  # a flight that is slower than its clock does not hurry afterwards
+            self.begun -= early  # a rollout that is slower than its clock does not hurry afterwards
         if self.steps == 0 or time.monotonic() - self.drawn > 1 / PICTURES:
             self.drawn = time.monotonic()
             self.clock.value = f"{self.steps / self.config.control_frequency:.1f} s"

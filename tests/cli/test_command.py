@@ -27,22 +27,22 @@ ROOT = Path(__file__).parents[2]
 class World:
     """A group with one dataclass."""
 
-    num_agents: Any = setting(32, "agents in a flock, or several sizes", low=1)
-    comm_range: float = setting(3.5, "hearing distance, m", above=0)
+    num_agents: Any = setting(32, "agents in a flock, or several sizes", ge=1)
+    comm_range: float = setting(3.5, "hearing distance, m", gt=0)
 
 
 @dataclass
 class Trainer:
     """What the choices of the second group share."""
 
-    lr: float = setting(1e-3, "learning rate", above=0, high=1)
+    lr: float = setting(1e-3, "learning rate", gt=0, le=1)
 
 
 @dataclass
 class Dagger(Trainer):
     """A choice with settings of its own."""
 
-    rounds: int = setting(10, "rounds of collection", low=1)
+    rounds: int = setting(10, "rounds of collection", ge=1)
     schedule: str = setting("linear", "mixing schedule", choices=("constant", "linear"))
 
 
@@ -50,7 +50,7 @@ class Dagger(Trainer):
 class Toy:
     """The whole configuration."""
 
-    seed: int = setting(0, "random seed, $5 or ${more}", low=0)
+    seed: int = setting(0, "random seed, $5 or ${more}", ge=0)
     source: str = setting("here", "where from")
     env: World = field(default_factory=World)
     trainer: Trainer = field(default_factory=Trainer)

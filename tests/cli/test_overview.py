@@ -90,7 +90,7 @@ def test_tab_in_bash(tmp_path):
         "modgnn_rl.reproduce" if "replay" not in NAMES else "modgnn_rl.replay modgnn_rl.reproduce",
         "--multirun",
         "bc dagger mappo",  # what stands behind =, where bash breaks words
-        "trainer.rotate= trainer.round_steps= trainer.round_updates= trainer.rounds=",
+        "trainer.rotate= trainer.rounds=",
         "sort=",
         "",  # then bash completes files
         "",

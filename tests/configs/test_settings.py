@@ -17,7 +17,7 @@ from modgnn_rl.errors import InputError
 class Inner:
     """Nested settings."""
 
-    speed: float = setting(1.0, "speed, m/s", above=0)
+    speed: float = setting(1.0, "speed, m/s", gt=0)
 
 
 @dataclass
@@ -25,11 +25,11 @@ class Outer:
     """One setting of each kind."""
 
     inner: Inner = field(default_factory=Inner)
-    count: Any = setting(3, "how many", low=1, high=9, whole=True)
+    count: Any = setting(3, "how many", ge=1, le=9, whole=True)
     kind: str = setting("a", "which", choices=("alpha", "a"))
-    rates: list[float] = setting([1.0, 2.0], "rates", low=0, length=2)
+    rates: list[float] = setting([1.0, 2.0], "rates", ge=0, length=2)
     name: str | None = setting(None, "name")
-    limit: float | None = setting(None, "limit", above=0)
+    limit: float | None = setting(None, "limit", gt=0)
 
 
 def test_the_defaults_pass():
@@ -74,4 +74,4 @@ def test_a_suggestion_needs_a_likeness():
 def test_every_setting_is_documented(name):
     for item in dataclasses.fields(getattr(schema, name)):
         nested = dataclasses.is_dataclass(item.default_factory) or item.name == "trainer"
-        assert nested or item.metadata["doc"], f"{name}.{item.name}"
+        assert nested or item.metadata["help"], f"{name}.{item.name}"

@@ -19,8 +19,8 @@ from tensordict import TensorDict
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
 from modgnn_rl.data import collect as collect_module
 from modgnn_rl.data import manifest
-from modgnn_rl.data.collect import collect, fly_expert, report
-from modgnn_rl.data.dataset import FlightDataset
+from modgnn_rl.data.collect import collect, report, rollout_expert
+from modgnn_rl.data.dataset import EpisodeDataset
 from modgnn_rl.data.manifest import MANIFEST, STATE, Manifest
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
@@ -44,11 +44,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 def test_one_seed_fixes_the_flights_and_no_two_are_equal(tmp_path: Path, whole: dict[str, bytes]) -> None:
     assert content(collect(config(tmp_path / "again"))) == whole
-    other = FlightDataset.open(collect(config(tmp_path / "other", seed=1)))
+    other = EpisodeDataset.open(collect(config(tmp_path / "other", seed=1)))
     states = torch.cat(
-        [shard["state"] for data in (FlightDataset.open(tmp_path / "again"), other) for shard in data.shards]
+        [shard["state"] for data in (EpisodeDataset.open(tmp_path / "again"), other) for shard in data.shards]
     )
-    assert len({str(flight.tolist()) for flight in states}) == 10
+    assert len({str(rollout.tolist()) for rollout in states}) == 10
 
 
 class Killed(BaseException):
@@ -56,7 +56,7 @@ class Killed(BaseException):
 
 
 STOPS: list[tuple[Any, str]] = [
-    (collect_module, "fly_expert"),
+    (collect_module, "rollout_expert"),
     (collect_module, "fsync_file"),
     (os, "replace"),
     (collect_module, "describe_files"),
@@ -89,9 +89,9 @@ def test_what_was_stopped_goes_on_to_the_same_bits(
             collect(config(tmp_path / "set"))
     if (tmp_path / "set" / MANIFEST).exists():
         with pytest.raises(InputError, match=r"is not complete, it has [012] of 3 shards; run the same"):
-            FlightDataset.open(tmp_path / "set")
+            EpisodeDataset.open(tmp_path / "set")
     assert content(collect(config(tmp_path / "set"))) == whole
-    FlightDataset.open(tmp_path / "set")
+    EpisodeDataset.open(tmp_path / "set")
 
 
 def test_leftovers_of_a_killed_process_go(tmp_path: Path, whole: dict[str, bytes]) -> None:
@@ -104,14 +104,14 @@ def test_leftovers_of_a_killed_process_go(tmp_path: Path, whole: dict[str, bytes
 def test_ctrl_c_says_how_far_it_got(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    real = fly_expert
+    real = rollout_expert
 
     def interrupted(env: FlockingEnv, *arguments: Any) -> Any:
         if env.batch_size[0] == 1:
             raise KeyboardInterrupt
         return real(env, *arguments)
 
-    monkeypatch.setattr(collect_module, "fly_expert", interrupted)
+    monkeypatch.setattr(collect_module, "rollout_expert", interrupted)
     with pytest.raises(KeyboardInterrupt):
         collect(config(tmp_path / "set"))
     assert "has 2 of 3 shards, and the same command goes on from there" in capsys.readouterr().err
@@ -184,34 +184,34 @@ def test_other_settings_are_refused(
     ],
 )
 def test_worlds_that_positions_do_not_tell_are_refused(tmp_path: Path, setting: str, value: Any) -> None:
-    world = dataclasses.replace(WORLD, **{setting: value})
+    env_config = dataclasses.replace(WORLD, **{setting: value})
     with pytest.raises(InputError, match=f"env.{setting}="):
-        collect(config(tmp_path / "set", env=world))
+        collect(config(tmp_path / "set", env=env_config))
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    "world",
+    "env_config",
     [
         {"wind": 2.0},
         {"leader": "waypoints", "start": "clusters"},
         {"physics": "bullet", "collisions": True, "start_distance": 0.0, "start_radius": 0.5},
     ],
 )
-def test_flights_do_not_depend_on_those_before(tmp_path: Path, world: dict[str, Any]) -> None:
-    if "physics" in world:
+def test_flights_do_not_depend_on_those_before(tmp_path: Path, env_config: dict[str, Any]) -> None:
+    if "physics" in env_config:
         pytest.importorskip("pybullet")
-    world = {"env": dataclasses.replace(WORLD, **world), "steps": 10, "episodes": 4}
-    one = collect(config(tmp_path / "one", **world))
-    other = collect(config(tmp_path / "other", **world))
+    env_config = {"env": dataclasses.replace(WORLD, **env_config), "steps": 10, "episodes": 4}
+    one = collect(config(tmp_path / "one", **env_config))
+    other = collect(config(tmp_path / "other", **env_config))
     shutil.rmtree(other / "shard_00001")
-    assert content(collect(config(other, **world))) == content(one)
+    assert content(collect(config(other, **env_config))) == content(one)
 
 
 def test_nothing_ends_a_flight() -> None:
-    world = FlockingConfig(num_agents=5, max_steps=3, max_distance=0.1, max_colliding=0.01, collision_distance=9.0)
-    states = fly_expert(FlockingEnv(3, config=world, seed=0), 12)
-    plain = fly_expert(FlockingEnv(3, config=FlockingConfig(num_agents=5), seed=0), 12)
+    env_config = FlockingConfig(num_agents=5, max_steps=3, max_distance=0.1, max_colliding=0.01, collision_distance=9.0)
+    states = rollout_expert(FlockingEnv(3, config=env_config, seed=0), 12)
+    plain = rollout_expert(FlockingEnv(3, config=FlockingConfig(num_agents=5), seed=0), 12)
     assert torch.equal(states, plain)
     assert not states[:, 0, :, 3:].any()
     assert states[:, 1:, 1:, 3:].any(-1).all()
@@ -222,7 +222,7 @@ def test_nothing_ends_a_flight() -> None:
 
 def test_a_full_disk_is_refused_beforehand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 0, 5 * 10**6))
-    with pytest.raises(InputError, match=r"flights take 23,040 MB and the disk of .* has 5 MB free; make room"):
+    with pytest.raises(InputError, match=r"rollouts take 23,040 MB and the disk of .* has 5 MB free; make room"):
         collect(config(tmp_path / "deep" / "set", episodes=30_000, steps=1000, env=FlockingConfig()))
     assert list(tmp_path.iterdir()) == []
 
@@ -237,7 +237,7 @@ def test_a_file_in_the_way_is_one_sentence(tmp_path: Path, name: str) -> None:
 
 def test_a_folder_of_other_things_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("mine")
-    with pytest.raises(InputError, match="no dataset of flights"):
+    with pytest.raises(InputError, match="no dataset of rollouts"):
         collect(config(tmp_path))
     assert content(tmp_path) == {"mine": b"mine"}
 
@@ -257,9 +257,11 @@ def test_two_processes_do_not_write_one_dataset(tmp_path: Path) -> None:
 
 
 def test_the_report_ends_with_the_command_that_trains_in_the_same_world(tmp_path: Path) -> None:
-    world = FlockingConfig(num_agents=4, separation_gain=0.7, leader_max_speed=float("inf"), start="grid", ground=-9.0)
-    text = report(collect(config(tmp_path / "my set", env=world)))
-    assert "5 flights of 4 steps with 4 agents are in" in text
+    env_config = FlockingConfig(
+        num_agents=4, separation_gain=0.7, leader_max_speed=float("inf"), start="grid", ground=-9.0
+    )
+    text = report(collect(config(tmp_path / "my set", env=env_config)))
+    assert "5 rollouts of 4 steps with 4 agents are in" in text
     assert text.endswith(
         f"python -m modgnn_rl.train trainer=bc 'trainer.dataset={tmp_path}/my set' env.num_agents=4 "
         "env.separation_gain=0.7 env.start=grid env.leader_max_speed=inf env.ground=-9.0"

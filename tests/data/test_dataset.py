@@ -1,4 +1,4 @@
-"""A dataset of flights: what comes back is what was flown, and nothing else comes back."""
+"""A dataset of rollouts: what comes back is what was flown, and nothing else comes back."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchrl.modules import get_primers_from_module, set_recurrent_mode
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
 from modgnn_rl.data.collect import collect
-from modgnn_rl.data.dataset import FlightDataset
+from modgnn_rl.data.dataset import EpisodeDataset
 from modgnn_rl.data.manifest import MANIFEST, STATE
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
@@ -43,8 +43,8 @@ def copy(folder: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "copy"))
 
 
-def flights(policy: Any = None) -> TensorDict:
-    """The same flights, flown here by TorchRL; with the actions of a policy that looks on; [E, T]."""
+def rollouts(policy: Any = None) -> TensorDict:
+    """The same rollouts, flown here by TorchRL; with the actions of a policy that looks on; [E, T]."""
     shards = []
     for name, flocks in (("shard_00000", 2), ("shard_00001", 2), ("shard_00002", 1)):
         env = FlockingEnv(flocks, config=WORLD, seed=derive_seed(3, name))
@@ -64,16 +64,16 @@ def flights(policy: Any = None) -> TensorDict:
 
 
 def test_what_is_stored_is_what_the_expert_flew(folder: Path) -> None:
-    dataset, flown = FlightDataset.open(folder), flights()
+    dataset, flown = EpisodeDataset.open(folder), rollouts()
     assert (dataset.episodes, dataset.steps, dataset.num_agents, len(dataset)) == (5, 9, 6, 45)
-    assert dataset.world == FlockingConfig(**{**vars(WORLD), "max_steps": STEPS})
+    assert dataset.env_config == FlockingConfig(**{**vars(WORLD), "max_steps": STEPS})
     stored = torch.cat([shard["state"] for shard in dataset.shards])
     assert torch.equal(stored, flown["agents", "observation"])
 
 
 @pytest.mark.parametrize("length", [1, 2, 4])
 def test_windows_are_the_environments_data_and_its_experts(folder: Path, length: int) -> None:
-    dataset, flown = FlightDataset.open(folder), flights()
+    dataset, flown = EpisodeDataset.open(folder), rollouts()
     windows = dataset.windows(torch.arange(len(dataset)), length)
     assert windows.batch_size == (len(dataset), length)
     for index in range(len(dataset)):
@@ -89,7 +89,7 @@ def test_windows_are_the_environments_data_and_its_experts(folder: Path, length:
 @pytest.mark.parametrize(("name", "layers"), [("pair_force", 1), ("modgnn_mlp", 1), ("gcn", 2)])
 def test_a_policy_does_at_the_end_of_a_window_what_it_does_in_flight(folder: Path, name: str, layers: int) -> None:
     policy = make_model(name, hops=2, layers=layers, seed=0)
-    flown, dataset = flights(policy), FlightDataset.open(folder)
+    flown, dataset = rollouts(policy), EpisodeDataset.open(folder)
     windows = dataset.windows(torch.arange(len(dataset)), policy.window)
     with set_recurrent_mode(True), torch.no_grad():
         action = policy(windows)["agents", "action"][:, -1]
@@ -99,26 +99,26 @@ def test_a_policy_does_at_the_end_of_a_window_what_it_does_in_flight(folder: Pat
 @pytest.mark.parametrize("index", [[-1], [45], [0, 44, 45]])
 def test_states_that_do_not_exist_are_refused(folder: Path, index: list[int]) -> None:
     with pytest.raises(InputError, match="indices are 0 to 44"):
-        FlightDataset.open(folder).windows(torch.tensor(index), 1)
+        EpisodeDataset.open(folder).windows(torch.tensor(index), 1)
 
 
 def test_a_shard_is_a_memory_mapped_tensordict(folder: Path) -> None:
-    for number, shard in enumerate(FlightDataset.open(folder).shards):
+    for number, shard in enumerate(EpisodeDataset.open(folder).shards):
         loaded = TensorDict.load_memmap(folder / f"shard_{number:05d}")
         assert loaded.batch_size == shard.batch_size
         assert torch.equal(loaded["state"], shard["state"])
 
 
 def test_changes_do_not_reach_the_files(folder: Path) -> None:
-    FlightDataset.open(folder).shards[0]["state"].zero_()
-    assert FlightDataset.open(folder).shards[0]["state"].any()
+    EpisodeDataset.open(folder).shards[0]["state"].zero_()
+    assert EpisodeDataset.open(folder).shards[0]["state"].any()
 
 
 # Batches
 
 
 def test_a_buffer_serves_the_windows_of_its_episodes_alone(folder: Path) -> None:
-    dataset = FlightDataset.open(folder)
+    dataset = EpisodeDataset.open(folder)
     buffer = dataset.buffer(2, 400, episodes=range(2, 4), generator=torch.Generator().manual_seed(0))
     batch = buffer.sample()
     assert batch.batch_size == (400, 2)
@@ -128,7 +128,7 @@ def test_a_buffer_serves_the_windows_of_its_episodes_alone(folder: Path) -> None
 
 
 def test_equal_generators_draw_equal_batches(folder: Path) -> None:
-    dataset = FlightDataset.open(folder)
+    dataset = EpisodeDataset.open(folder)
     batches = [
         dataset.buffer(1, 8, generator=torch.Generator().manual_seed(seed)).sample()["agents", "observation"]
         for seed in (0, 0, 1)
@@ -140,7 +140,7 @@ def test_equal_generators_draw_equal_batches(folder: Path) -> None:
 @pytest.mark.parametrize("episodes", [range(3, 6), range(0), range(-1, 2), range(0, 4, 2)])
 def test_episodes_that_do_not_exist_are_refused(folder: Path, episodes: range) -> None:
     with pytest.raises(InputError, match="are not some of the 5 episodes"):
-        FlightDataset.open(folder).buffer(1, 8, episodes=episodes)
+        EpisodeDataset.open(folder).buffer(1, 8, episodes=episodes)
 
 
 # Damage
@@ -157,7 +157,7 @@ def test_no_bit_can_change(folder: Path, tmp_path_factory: pytest.TempPathFactor
     file.write_bytes(content)
     name = file.parent.name if file.parent != path else MANIFEST
     with pytest.raises(InputError, match=name):
-        FlightDataset.open(path)
+        EpisodeDataset.open(path)
 
 
 class Malicious:
@@ -192,7 +192,7 @@ def _edit(**changes: Any) -> Callable[[Path], None]:
         (lambda path: shutil.rmtree(path / "shard_00001"), "shard_00001 is damaged .it is missing.*run the same"),
         (lambda path: (path / "shard_00002" / STATE).unlink(), "shard_00002.*state.memmap is missing"),
         (lambda path: os.truncate(path / "shard_00000" / STATE, 400), "shard_00000.*has 400 bytes instead of 2592"),
-        (lambda path: (path / MANIFEST).unlink(), "no dataset of flights.*modgnn_rl.collect makes one"),
+        (lambda path: (path / MANIFEST).unlink(), "no dataset of rollouts.*modgnn_rl.collect makes one"),
         (lambda path: (path / MANIFEST).write_text("[" * 100_000), "manifest.json is damaged"),
         (lambda path: (path / MANIFEST).write_text("null"), "manifest.json is damaged"),
         (lambda path: (path / MANIFEST).write_bytes(b"\xff\xfe"), "manifest.json is damaged"),
@@ -207,16 +207,16 @@ def _edit(**changes: Any) -> Callable[[Path], None]:
 def test_damage_is_named(copy: Path, verify: bool, spoil: Callable[[Path], None], message: str) -> None:
     spoil(copy)
     with pytest.raises(InputError, match=message):
-        FlightDataset.open(copy, verify=verify)
+        EpisodeDataset.open(copy, verify=verify)
     assert not (copy.parent / "executed").exists()
 
 
 def test_without_verification_sizes_alone_are_compared(copy: Path) -> None:
     file = copy / "shard_00000" / STATE
     file.write_bytes(bytes(file.stat().st_size))
-    assert not FlightDataset.open(copy, verify=False).shards[0]["state"].any()
+    assert not EpisodeDataset.open(copy, verify=False).shards[0]["state"].any()
     with pytest.raises(InputError, match=r"shard_00000.*has changed since it was written"):
-        FlightDataset.open(copy)
+        EpisodeDataset.open(copy)
 
 
 # Worlds
@@ -237,13 +237,15 @@ def test_without_verification_sizes_alone_are_compared(copy: Path) -> None:
     ],
 )
 def test_another_world_is_refused_with_the_difference(folder: Path, setting: str, value: Any) -> None:
-    world = FlockingConfig(**{**vars(WORLD), setting: value})
+    env_config = FlockingConfig(**{**vars(WORLD), setting: value})
     with pytest.raises(InputError) as error:
-        FlightDataset.open(folder).check_world(world)
+        EpisodeDataset.open(folder).check_world(env_config)
     there = getattr(WORLD, setting)
     assert f"of another world than env: env.{setting}={value} (there {there});" in str(error.value)
 
 
 def test_what_has_no_effect_may_differ(folder: Path) -> None:
-    world = FlockingConfig(**{**vars(WORLD), "num_agents": [6], "max_steps": 7, "max_distance": 5.0, "compile": True})
-    FlightDataset.open(folder).check_world(world)
+    env_config = FlockingConfig(
+        **{**vars(WORLD), "num_agents": [6], "max_steps": 7, "max_distance": 5.0, "compile": True}
+    )
+    EpisodeDataset.open(folder).check_world(env_config)

@@ -31,7 +31,7 @@ AGENTS, FEATURES, WIDTH, LINK_FEATURES, STEPS = 4, 6, 4, 2, 6
 LOCAL_STARTS = ("mask", "zero")
 
 
-class Flight:
+class Rollout:
     """Random observations, graphs and mishaps, flown by the policy for all agents and by the agents themselves."""
 
     def __init__(self, policy: ModGNN, seed: int, links: LinkData | None = None, dtype: torch.dtype = torch.float64):
@@ -183,24 +183,24 @@ def test_agents_fly_as_the_policy_does(
     for number, count in enumerate(hops):
         f_com = [make() for _ in range(count)]
         layers.append(full_layer(count, f_com, FEATURES + 3 * number, start=start, aggregation=aggregation))
-    Flight(ModGNN(layers, link_feature="feature" if links.feature else None), seed, links).run()
+    Rollout(ModGNN(layers, link_feature="feature" if links.feature else None), seed, links).run()
 
 
 @pytest.mark.parametrize(("hops", "layers"), [(0, 1), (1, 1), (3, 1), (2, 2)])
 @pytest.mark.parametrize("name", [name for name in MODELS if name != "central"])
 def test_every_model_flies_agent_by_agent(name: str, hops: int, layers: int) -> None:
-    Flight(make_model(name, hops, 8, layers=layers, seed=1), seed=hops).run()
+    Rollout(make_model(name, hops, 8, layers=layers, seed=1), seed=hops).run()
 
 
 def test_single_precision_is_equal_up_to_rounding() -> None:
-    Flight(make_model("modgnn_mlp", 2, 8, seed=1), seed=1, dtype=torch.float32).run(1e-5)
+    Rollout(make_model("modgnn_mlp", 2, 8, seed=1), seed=1, dtype=torch.float32).run(1e-5)
 
 
 def test_an_f_com_may_change_the_width_between_hops() -> None:
     torch.manual_seed(0)
     f_mid = [nn.Linear(FEATURES * width, 3) for width in (1, 2, 4, 8)]
     last = ModGNNLayer(1, f_mid=[nn.Linear(FEATURES + 3, 2) for _ in range(2)])
-    Flight(ModGNN([ModGNNLayer(3, f_com=_Both(), f_mid=f_mid), last]), seed=0).run()
+    Rollout(ModGNN([ModGNNLayer(3, f_com=_Both(), f_mid=f_mid), last]), seed=0).run()
 
 
 def test_modules_may_work_in_place() -> None:
@@ -211,7 +211,7 @@ def test_modules_may_work_in_place() -> None:
         )
         for n in range(2)
     ]
-    Flight(ModGNN(layers), seed=0).run()
+    Rollout(ModGNN(layers), seed=0).run()
 
 
 # What an agent is told.

@@ -100,7 +100,7 @@ class Heard:
 
 
 def test_an_exported_agent_is_the_agent(exported: Exported) -> None:
-    """The flight goes on over a reboot and over a step at which the agent sees nothing."""
+    """The rollout goes on over a reboot and over a step at which the agent sees nothing."""
     heard, agent, robot = Heard(), Agent(everything().eval(), LINKS), OnnxAgent(exported.folder)
     program = torch.export.load(exported.folder / "agent.pt2").module()
     for step, count in enumerate(NEIGHBOURS * 2):

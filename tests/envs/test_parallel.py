@@ -1,4 +1,4 @@
-"""Flocks in worker processes: the flights are those of one process, and nothing outlives its parent or hangs."""
+"""Flocks in worker processes: the rollouts are those of one process, and nothing outlives its parent or hangs."""
 
 from __future__ import annotations
 
@@ -62,19 +62,21 @@ def test_flights_are_those_of_one_process(env: ParallelFlocks) -> None:
 def test_policy_with_memory_flies_them(env: ParallelFlocks) -> None:
     policy = make_model("modgnn_mlp", seed=0)
 
-    def fly(flocks: EnvBase) -> TensorDictBase:
+    def rollout(flocks: EnvBase) -> TensorDictBase:
         with torch.no_grad():
             wrapped = TransformedEnv(flocks, Compose(InitTracker(), policy.make_tensordict_primer()))
             return wrapped.rollout(4, policy)
 
     seed = 7
     env.set_seed(seed)
-    flights = fly(env)
-    assert flights.shape == (WORKERS, FLOCKS, 4)
-    for flight in flights:
+    rollouts = rollout(env)
+    assert rollouts.shape == (WORKERS, FLOCKS, 4)
+    for own in rollouts:
         alone = FlockingEnv(FLOCKS, AGENTS, physics="bullet")
         seed = alone.set_seed(seed)
-        torch.testing.assert_close(fly(alone)["next", "agents", "observation"], flight["next", "agents", "observation"])
+        torch.testing.assert_close(
+            rollout(alone)["next", "agents", "observation"], own["next", "agents", "observation"]
+        )
 
 
 def test_death_of_a_worker_is_an_error_that_ends_all(env: ParallelFlocks) -> None:
@@ -145,7 +147,7 @@ def test_workers_end_when_the_parent_is_killed_in_flight(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("activity", ["sleep", "fly"])
+@pytest.mark.parametrize("activity", ["sleep", "rollout"])
 def test_interrupt_ends_all_and_only_the_parent_speaks(tmp_path: Path, activity: str) -> None:
     parent, workers = start(tmp_path, "bullet", activity)
     time.sleep(1)

@@ -1,4 +1,4 @@
-"""Evaluation flights and their table."""
+"""Evaluation rollouts and their table."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import TorchPhysics
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation.rollout import evaluate, fly, reference_policies
-from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_flights
+from modgnn_rl.evaluation.rollout import evaluate, reference_policies, rollout
+from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_rollouts
 
 FLIGHT = {"num_agents": 6, "num_flocks": 4, "steps": 40, "seed": 3}
 
 
 @pytest.fixture(scope="module")
-def flights():
+def rollouts():
     return evaluate({"gcn": make_model("gcn", seed=0)}, FlockingConfig(), **FLIGHT)
 
 
-def test_reference_rows_have_the_errors_they_must_have(flights):
-    assert flights["expert"].error.max() == 0
-    assert (flights["zero action"].error > flights["LocalReynolds(hops=2)"].error).all()
+def test_reference_rows_have_the_errors_they_must_have(rollouts):
+    assert rollouts["expert"].error.max() == 0
+    assert (rollouts["zero action"].error > rollouts["LocalReynolds(hops=2)"].error).all()
     # The expert is clipped to the ball of 0.92 m/s and mostly on its surface: doing nothing scores |u|^2 / 3.
-    assert 0.2 < float(flights["zero action"].error.mean()) <= 0.92**2 / 3
+    assert 0.2 < float(rollouts["zero action"].error.mean()) <= 0.92**2 / 3
 
 
-def test_the_flight_is_fixed_by_its_seed(flights):
-    again = fly(make_model("gcn", seed=0), FlockingConfig(), **FLIGHT)
-    assert torch.equal(again.error, flights["gcn"].error)
-    assert torch.equal(again.smallest_distance, flights["gcn"].smallest_distance)
+def test_the_flight_is_fixed_by_its_seed(rollouts):
+    again = rollout(make_model("gcn", seed=0), FlockingConfig(), **FLIGHT)
+    assert torch.equal(again.error, rollouts["gcn"].error)
+    assert torch.equal(again.min_distance, rollouts["gcn"].min_distance)
 
 
 def test_all_rows_have_the_same_starts_and_leaders():
@@ -47,7 +47,7 @@ def test_all_rows_have_the_same_starts_and_leaders():
             return super().forward(tensordict)
 
     for policy in reference_policies(FlockingConfig()).values():
-        fly(Spy(policy), FlockingConfig(), **FLIGHT)
+        rollout(Spy(policy), FlockingConfig(), **FLIGHT)
     first, *others = seen.values()
     assert len(others) == 3
     for other in others:
@@ -59,9 +59,9 @@ def test_all_rows_have_the_same_starts_and_leaders():
 def test_a_policy_flies_the_same_in_both_physics():
     policy = make_model("pair_force", seed=0)
     torch_flights, bullet_flights = (
-        fly(policy, FlockingConfig(physics=name), **FLIGHT) for name in ("torch", "bullet")
+        rollout(policy, FlockingConfig(physics=name), **FLIGHT) for name in ("torch", "bullet")
     )
-    for name in ("error", "leader_distance", "cohesion", "separation", "smallest_distance", "reward"):
+    for name in ("error", "leader_distance", "cohesion", "separation", "min_distance", "reward"):
         torch.testing.assert_close(getattr(bullet_flights, name), getattr(torch_flights, name), rtol=1e-3, atol=1e-4)
     assert torch.equal(bullet_flights.lost, torch_flights.lost)
 
@@ -70,13 +70,13 @@ def test_flights_leave_no_physics_behind(monkeypatch):
     """Each flock in PyBullet holds a client until its environment is closed."""
     closed = []
     monkeypatch.setattr(TorchPhysics, "close", lambda physics: closed.append(physics))
-    fly(make_model("gcn", seed=0), FlockingConfig(), **FLIGHT)
+    rollout(make_model("gcn", seed=0), FlockingConfig(), **FLIGHT)
     assert len(closed) == 1
 
 
 def test_truth_is_measured_where_sensors_are_noisy():
     quiet, noisy = (
-        fly(Reynolds(action=("agents", "action"), observation=key), config, **FLIGHT)
+        rollout(Reynolds(action=("agents", "action"), observation=key), config, **FLIGHT)
         for key, config in (
             (("agents", "observation"), FlockingConfig()),
             (("agents", "state"), FlockingConfig(position_noise=0.5)),
@@ -86,49 +86,49 @@ def test_truth_is_measured_where_sensors_are_noisy():
     assert noisy.error.max() == 0
 
 
-def test_quarters_average_to_the_error(flights):
-    for flight in flights.values():
-        torch.testing.assert_close(flight.error_by_quarter.mean(-1).double(), flight.error, rtol=1e-4, atol=1e-6)
+def test_quarters_average_to_the_error(rollouts):
+    for metrics in rollouts.values():
+        torch.testing.assert_close(metrics.error_by_quarter.mean(-1).double(), metrics.error, rtol=1e-4, atol=1e-6)
 
 
 def test_a_diverging_flock_is_flown_to_the_end_and_counted():
     away = TensorDictModule(
         lambda observation: 10 * observation[..., :3], [("agents", "observation")], [("agents", "action")]
     )
-    flight = fly(away, FlockingConfig(max_distance=5.0), num_agents=6, num_flocks=3, steps=400, seed=0)
-    assert flight.diverged.all()
-    assert flight.lost.all()
+    metrics = rollout(away, FlockingConfig(max_distance=5.0), num_agents=6, num_flocks=3, steps=400, seed=0)
+    assert metrics.diverged.all()
+    assert metrics.lost.all()
 
 
 @pytest.mark.parametrize("agents", [1, 2])
 def test_the_smallest_flocks_have_a_table_too(agents):
-    flights = evaluate({}, FlockingConfig(), num_agents=agents, num_flocks=3, steps=8, seed=0)
-    assert "| expert" in as_markdown(_tables(flights, agents), "few")
+    rollouts = evaluate({}, FlockingConfig(), num_agents=agents, num_flocks=3, steps=8, seed=0)
+    assert "| expert" in as_markdown(_tables(rollouts, agents), "few")
 
 
-def test_table_gives_mean_median_spread_and_paired_difference(flights):
-    table = summarise_flights(flights, seed=0)
+def test_table_gives_mean_median_spread_and_paired_difference(rollouts):
+    table = summarise_rollouts(rollouts, seed=0)
     row = table["gcn"]
-    errors = flights["gcn"].error
+    errors = rollouts["gcn"].error
     assert row["error"]["mean"] == pytest.approx(float(errors.mean()))
     assert row["error"]["median"] == pytest.approx(float(errors.quantile(0.5)))
     assert row["error"]["low"] <= row["error"]["mean"] <= row["error"]["high"]
-    difference = errors - flights["LocalReynolds(hops=1)"].error
+    difference = errors - rollouts["LocalReynolds(hops=1)"].error
     assert row["error_minus_local"]["mean"] == pytest.approx(float(difference.mean()))
     assert "error_minus_local" not in table["LocalReynolds(hops=1)"]
 
 
-def test_markdown_holds_every_row(flights):
-    text = as_markdown(_tables(flights, 6), "title")
-    assert all(text.count(f"| {name} ") == 2 for name in flights)
-    assert "## 6 agents, 4 flights of 40 steps" in text
+def test_markdown_holds_every_row(rollouts):
+    text = as_markdown(_tables(rollouts, 6), "title")
+    assert all(text.count(f"| {name} ") == 2 for name in rollouts)
+    assert "## 6 agents, 4 rollouts of 40 steps" in text
 
 
-def test_tables_are_read_back(flights, tmp_path):
+def test_tables_are_read_back(rollouts, tmp_path):
     file = tmp_path / "evaluation.json"
     assert read_tables(file) == {}
-    file.write_text(json.dumps(_tables(flights, 6)))
-    assert read_tables(file)["6"]["rows"]["gcn"] == summarise_flights(flights, seed=0)["gcn"]
+    file.write_text(json.dumps(_tables(rollouts, 6)))
+    assert read_tables(file)["6"]["rows"]["gcn"] == summarise_rollouts(rollouts, seed=0)["gcn"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}]", '{"six": {"rows": {}}}', '{"6": 1}', '{"6": {}}'])
@@ -139,5 +139,5 @@ def test_a_damaged_table_is_refused(text, tmp_path):
         read_tables(file)
 
 
-def _tables(flights, agents):
-    return {str(agents): {"num_flocks": 4, "steps": 40, "rows": summarise_flights(flights, seed=0)}}
+def _tables(rollouts, agents):
+    return {str(agents): {"num_flocks": 4, "steps": 40, "rows": summarise_rollouts(rollouts, seed=0)}}

@@ -108,14 +108,14 @@ def test_the_middle_interval_has_the_width_of_theory() -> None:
 
 
 def test_the_middle_interval_draws_seeds_and_flights_within_them() -> None:
-    """Seeds that differ while their flights do not: resamples are means over drawn seeds, of nothing in between."""
+    """Seeds that differ while their rollouts do not: resamples are means over drawn seeds, of nothing in between."""
     between = interquartile_interval(np.array([[0.0] * 50, [1.0] * 50]), rng=rng(), resamples=500)
     assert (between.low, between.value, between.high) == (0.0, 0.5, 1.0)
     same = interquartile_interval(np.full((3, 4), 2.5), rng=rng(), resamples=20)
     assert (same.low, same.value, same.high) == (2.5, 2.5, 2.5)
-    # Flights that differ while seeds do not: more seeds with as many flights narrow the interval.
-    flights = rng(3).normal(size=100)
-    one, four = (interquartile_interval(np.tile(flights, (n, 1)), rng=rng(), resamples=800) for n in (1, 4))
+    # Rollouts that differ while seeds do not: more seeds with as many rollouts narrow the interval.
+    rollouts = rng(3).normal(size=100)
+    one, four = (interquartile_interval(np.tile(rollouts, (n, 1)), rng=rng(), resamples=800) for n in (1, 4))
     assert (four.high - four.low) == pytest.approx((one.high - one.low) / 2, rel=0.25)
 
 
@@ -130,7 +130,7 @@ def test_one_infinite_flight_does_not_move_the_middle() -> None:
         ([[0.0, 0.0]], [[1.0, 1.0]], 1.0),
         ([[1.0, 1.0]], [[0.0, 0.0]], 0.0),
         ([[1.0, 1.0]], [[1.0, 1.0]], 0.5),
-        ([[0.0, 10.0]], [[1.0, 11.0]], 1.0),  # each flight is compared with itself
+        ([[0.0, 10.0]], [[1.0, 11.0]], 1.0),  # each rollout is compared with itself
         ([[0.0, 2.0]], [[1.0, 1.0]], 0.5),
         ([[0.0], [2.0]], [[1.0], [3.0]], 0.75),  # three of four pairs of seeds
         ([[0.0], [np.inf]], [[np.inf]], 0.75),
@@ -152,7 +152,7 @@ def test_flights_of_other_worlds_all_meet() -> None:
 
 
 def test_probability_of_improvement_of_normal_data() -> None:
-    """P(X < Y) = Phi(d / sqrt 2) for normal data a distance d apart, with the variance of a share of flights."""
+    """P(X < Y) = Phi(d / sqrt 2) for normal data a distance d apart, with the variance of a share of rollouts."""
     x, y = rng(5).normal(size=(1, 4000)), rng(6).normal(loc=1.0, size=(1, 4000))
     found = probability_of_improvement(x, y, rng=rng(7), resamples=800)
     wanted = statistics.NormalDist().cdf(1 / np.sqrt(2))

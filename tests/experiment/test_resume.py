@@ -27,16 +27,23 @@ from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.utils.signals import Stopped
 
-SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}
-MAPPO: Any = {"num_envs": 2, "iterations": 5, "round_steps": 14, "critic_warmup": 1, "epochs": 1, "batches": 2}
-DAGGER: Any = {**SMALL, "cloning_steps": 12, "cloning_updates": 6, "rounds": 4, "round_steps": 12, "round_updates": 4}
+SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "num_val_envs": 2, "checkpoint_minutes": 0}
+MAPPO: Any = {"num_envs": 2, "rounds": 5, "steps_per_round": 14, "critic_warmup": 1, "epochs": 1, "num_minibatches": 2}
+DAGGER: Any = {
+    **SMALL,
+    "cloning_steps": 12,
+    "cloning_updates": 6,
+    "rounds": 4,
+    "steps_per_round": 12,
+    "updates_per_round": 4,
+}
 BC: Any = {**SMALL, "cloning_steps": 24, "cloning_updates": 6}
 RUNS: dict[str, dict[str, Any]] = {
     "bc": {"trainer": BCConfig(**BC)},
     "bc of several, with noise from the error": {
         "trainer": BCConfig(**BC, dart=True, models=["gcn", "modgnn_mlp"], seeds=2)
     },
-    "dagger": {"trainer": DAggerConfig(**DAGGER, expert_rounds=3)},
+    "dagger": {"trainer": DAggerConfig(**DAGGER, beta_rounds=3)},
     "dagger with a reservoir, stored messages, a plateau": {
         "trainer": DAggerConfig(**{**DAGGER, "capacity": 40}, replacement="reservoir", plateau_rounds=1),
         "model": ModelConfig(name="pair_force", hidden=8),
@@ -76,7 +83,7 @@ class Signal(Callback):
     def __init__(self, at, number=signal.SIGTERM):
         self.at, self.number = at, number
 
-    def on_flights(self, index, flights):
+    def on_flights(self, index, rollouts):
         """Send it."""
         if index == self.at:
             self.at = None

@@ -1,5 +1,6 @@
-"""Runs that are killed, on disks that are full, and files that are damaged: `pytest -m slow
-tests/experiment/test_survival.py`.
+"""Runs that are killed, on disks that are full, and files that are damaged.
+
+Run with ``pytest -m slow tests/experiment/test_survival.py``.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint, save_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 
-SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}
+SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 150, "num_val_envs": 2, "checkpoint_minutes": 0}
 TRAINERS: dict[str, Any] = {
     "bc": BCConfig(**SMALL, cloning_steps=24, cloning_updates=30),
     "dagger": DAggerConfig(
-        **SMALL, cloning_steps=12, cloning_updates=6, rounds=20, round_steps=12, round_updates=2, expert_rounds=3
+        **SMALL, cloning_steps=12, cloning_updates=6, rounds=20, steps_per_round=12, updates_per_round=2, beta_rounds=3
     ),
     "mappo": MAPPOConfig(
-        num_envs=1, iterations=20, round_steps=8, critic_warmup=1, epochs=1, batches=2, checkpoint_minutes=0
+        num_envs=1, rounds=20, steps_per_round=8, critic_warmup=1, epochs=1, num_minibatches=2, checkpoint_minutes=0
     ),
 }
 MOMENTS = 20
@@ -51,8 +52,8 @@ TRAINERS["short"] = dataclasses.replace(TRAINERS["dagger"], rounds=6)
 
 
 def _config(runs: Path, trainer: str) -> TrainConfig:
-    world = FlockingConfig(num_agents=4, max_steps=15)
-    return TrainConfig(env=world, trainer=TRAINERS[trainer], runs=str(runs), threads=1)
+    env_config = FlockingConfig(num_agents=4, max_steps=15)
+    return TrainConfig(env=env_config, trainer=TRAINERS[trainer], runs=str(runs), threads=1)
 
 
 def _start(function, *arguments):

@@ -17,12 +17,12 @@ from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import (
     BCConfig,
     DAggerConfig,
+    EnvOverrides,
     EvaluateConfig,
     EvaluationConfig,
     FlockingConfig,
     ModelConfig,
     TrainConfig,
-    WorldChanges,
 )
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
@@ -53,9 +53,9 @@ def _dagger(**settings):
         "cloning_steps": 10,
         "cloning_updates": 4,
         "rounds": 3,
-        "round_steps": 5,
-        "round_updates": 2,
-        "held_out": 1,
+        "steps_per_round": 5,
+        "updates_per_round": 2,
+        "num_val_envs": 1,
     }
     return DAggerConfig(**{**SMALL, **small, **settings})
 
@@ -63,7 +63,7 @@ def _dagger(**settings):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> RunFolder:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dashboard_callback, "STEPS", 8)  # of the reference flights
+        patch.setattr(dashboard_callback, "STEPS", 8)  # of the reference rollouts
         return train(_config(tmp_path_factory.mktemp("runs"), _dagger(), logger="csv"))
 
 
@@ -73,7 +73,7 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
     assert config["env"]["comm_range"] == 3.5
     metrics = run.read_metrics()
     assert [line["step"] for line in metrics] == [0, 1, 2, 3]
-    for name in ("error", "loss", "leader_distance", "cohesion", "separation", "smallest_distance"):
+    for name in ("error", "loss", "leader_distance", "cohesion", "separation", "min_distance"):
         assert f"5/{name}" in metrics[-1]
     assert list(run.checkpoints.iterdir())
     table = json.loads((run.path / "evaluation.json").read_text())["5"]["rows"]
@@ -124,7 +124,7 @@ def test_evaluation_at_other_sizes(run):
 
 def test_evaluation_in_another_world_has_files_of_its_own(run):
     before = (run.path / "evaluation.json").read_text()
-    changes = WorldChanges(message_loss=0.5, physics="bullet")
+    changes = EnvOverrides(message_loss=0.5, physics="bullet")
     config = EvaluateConfig(
         run=str(run.path), evaluation=EvaluationConfig(num_flocks=2, steps=4), threads=1, env=changes
     )
@@ -134,7 +134,7 @@ def test_evaluation_in_another_world_has_files_of_its_own(run):
     assert json.loads(file.read_text())["5"]["num_flocks"] == 2
     assert (run.path / "evaluation.json").read_text() == before
     with pytest.raises(InputError, match=r"env\.max_links"):
-        evaluate_run(dataclasses.replace(config, env=WorldChanges(max_links="many")))
+        evaluate_run(dataclasses.replace(config, env=EnvOverrides(max_links="many")))
 
 
 def test_one_seed_fixes_a_run(tmp_path):
@@ -147,7 +147,7 @@ def test_one_seed_fixes_a_run(tmp_path):
 
 
 def test_behaviour_cloning_of_several_sizes(tmp_path):
-    trainer = BCConfig(**SMALL, cloning_steps=10, cloning_updates=40, held_out=2)
+    trainer = BCConfig(**SMALL, cloning_steps=10, cloning_updates=40, num_val_envs=2)
     env = FlockingConfig(num_agents=[3, 6])
     run = train(_config(tmp_path, trainer, env=env, model=ModelConfig(name="modgnn_mlp", hops=2, hidden=8)))
     assert {"3/validation_loss", "6/validation_loss"} <= set(run.read_metrics()[-1])
@@ -210,7 +210,7 @@ def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, arguments, words):
         (["env.start_distance=9"], "do not fit into a ball"),
         (["model.hops=0"], "has nothing to learn"),
         (["device=tpu9"], "device=tpu9"),
-        (["trainer.round_updates=1", "env.num_agents=[4,5]"], "too few for 2 sizes"),
+        (["trainer.updates_per_round=1", "env.num_agents=[4,5]"], "too few for 2 sizes"),
     ],
 )
 def test_a_mistake_that_training_finds_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capsys, arguments, words):
@@ -253,7 +253,7 @@ runpy.run_module("modgnn_rl.{command}", run_name="__main__")
 
 @pytest.mark.parametrize("model", ["moment_force", "mpnn"])
 def test_training_goes_on_under_faults_and_learns_from_the_true_state(tmp_path, model):
-    world = FlockingConfig(
+    env_config = FlockingConfig(
         num_agents=[4, 6],
         message_loss=0.3,
         delay=1,
@@ -265,16 +265,18 @@ def test_training_goes_on_under_faults_and_learns_from_the_true_state(tmp_path, 
     )
     seen = []
 
-    class Watch(Callback):
-        def on_flights(self, index, flights):
-            seen.append(flights.select(("agents", "state"), ("agents", "mask"), ("agents", "expert_action")).clone())
+    class DashboardCallback(Callback):
+        def on_flights(self, index, rollouts):
+            seen.append(rollouts.select(("agents", "state"), ("agents", "mask"), ("agents", "expert_action")).clone())
 
-    run = train(_config(tmp_path, _dagger(), env=world, model=ModelConfig(name=model)), callbacks=[Watch()])
-    for flights in seen:
-        agents = flights["agents"]
-        label = Reynolds.for_env(world)(flights.exclude(("agents", "expert_action")))["agents", "expert_action"]
+    run = train(
+        _config(tmp_path, _dagger(), env=env_config, model=ModelConfig(name=model)), callbacks=[DashboardCallback()]
+    )
+    for rollouts in seen:
+        agents = rollouts["agents"]
+        label = Reynolds.for_env(env_config)(rollouts.exclude(("agents", "expert_action")))["agents", "expert_action"]
         there = agents["mask"]
         torch.testing.assert_close(agents["expert_action"][there], label[there])
-    assert {there.shape[-1] for there in (flights["agents", "mask"] for flights in seen)} == {4, 6}
-    assert not all(bool(flights["agents", "mask"].all()) for flights in seen)  # somebody dropped out
+    assert {there.shape[-1] for there in (rollouts["agents", "mask"] for rollouts in seen)} == {4, 6}
+    assert not all(bool(rollouts["agents", "mask"].all()) for rollouts in seen)  # somebody dropped out
     assert all(parameter.isfinite().all() for parameter in load_policy(run.path).parameters())

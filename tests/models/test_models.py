@@ -44,7 +44,7 @@ def build(name: str, hops: int = 2, agents: int = 5, **options: Any) -> ModGNN:
     return make_model(name, hops, num_agents=agents, **options)
 
 
-def flight(seed: int, agents: int = 5, steps: int = 4) -> tuple[Tensor, Tensor]:
+def rollout(seed: int, agents: int = 5, steps: int = 4) -> tuple[Tensor, Tensor]:
     """Observations of two flocks, float64 [2, T, N, 6], and links within 2 m, some of them one-way."""
     generator = torch.Generator().manual_seed(seed)
     observation = torch.randn(2, steps, agents, 6, dtype=torch.float64, generator=generator)
@@ -71,7 +71,7 @@ def random_rotation(seed: int, determinant: int) -> Tensor:
 @torch.no_grad()
 def test_actions_stay_in_the_ball(name: str, layers: int, seed: int, scale: float) -> None:
     policy = build(name, layers=layers, max_speed=0.7, seed=seed).double()
-    observation, adjacency = flight(seed)
+    observation, adjacency = rollout(seed)
     speed = act(policy, scale * observation, adjacency).norm(dim=-1)
     assert speed.isfinite().all()
     assert speed.max() <= 0.7 * (1 + 1e-12)
@@ -86,7 +86,7 @@ def test_actions_stay_in_the_ball(name: str, layers: int, seed: int, scale: floa
 def test_absolute_position_is_hidden(name: str, layers: int, seed: int) -> None:
     policy = build(name, layers=layers, seed=seed).double()
     is_hidden = name != "modgnn_adjacency"  # its communication forms no differences
-    observation, adjacency = flight(seed)
+    observation, adjacency = rollout(seed)
     shift = torch.tensor([20.0, -7.0, 3.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     expected = act(policy, observation, adjacency)
     moved = act(policy, observation + shift, adjacency)
@@ -99,7 +99,7 @@ def test_absolute_position_is_hidden(name: str, layers: int, seed: int) -> None:
 @torch.no_grad()
 def test_pair_force_turns_with_the_world(seed: int, hops: int, layers: int, determinant: int) -> None:
     policy = make_model("pair_force", hops, seed=seed, max_speed=1e3, layers=layers).double()
-    observation, adjacency = flight(seed)
+    observation, adjacency = rollout(seed)
     rotation = random_rotation(seed, determinant)
     turned = (observation.unflatten(-1, (2, 3)) @ rotation).flatten(-2)
     action = act(policy, observation, adjacency)
@@ -112,7 +112,7 @@ def test_pair_force_turns_with_the_world(seed: int, hops: int, layers: int, dete
 def test_agents_are_interchangeable_and_of_any_number(name: str) -> None:
     policy = make_model(name, hops=1, seed=3).double()
     for agents in (1, 2, 9):
-        observation, adjacency = flight(0, agents)
+        observation, adjacency = rollout(0, agents)
         order = torch.arange(agents - 1, -1, -1)
         action = act(policy, observation, adjacency)
         assert action.shape == (2, 4, agents, 3)
@@ -124,7 +124,7 @@ def test_agents_are_interchangeable_and_of_any_number(name: str) -> None:
 @torch.no_grad()
 def test_who_hears_of_nobody_knows_its_own_velocity_only(name: str) -> None:
     policy = make_model(name, hops=1, seed=0).double()
-    observation, _ = flight(0)
+    observation, _ = rollout(0)
     alone = torch.zeros(2, 4, 5, 5, dtype=torch.bool)
     action = act(policy, observation, alone)
     if name == "pair_force":
@@ -139,7 +139,7 @@ def test_who_hears_of_nobody_knows_its_own_velocity_only(name: str) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_gradients_are_finite_where_lengths_vanish(name: str, layers: int, case: str, dtype: torch.dtype) -> None:
     policy = build(name, layers=layers, seed=0).to(dtype)
-    observation, adjacency = flight(0)
+    observation, adjacency = rollout(0)
     if case != "at rest":
         observation[..., 1, :3] = observation[..., 0, :3]
     if case != "coincident":
@@ -154,7 +154,7 @@ def test_gradients_are_finite_where_lengths_vanish(name: str, layers: int, case:
 @models
 def test_gradients_reach_every_parameter(name: str, layers: int) -> None:
     policy = build(name, layers=layers, seed=0, max_speed=100.0).double()
-    act(policy, *flight(0, steps=6)).square().sum().backward()
+    act(policy, *rollout(0, steps=6)).square().sum().backward()
     assert all(parameter.grad is not None and parameter.grad.any() for parameter in policy.parameters())
 
 
@@ -216,7 +216,7 @@ def test_a_model_of_ones_own_is_trained_and_loaded_by_its_name(own_names: None, 
         TrainConfig(
             env=FlockingConfig(num_agents=4),
             model=ModelConfig(name="shared_hops"),
-            trainer=DAggerConfig(rounds=1, num_envs=2, cloning_steps=10, cloning_updates=2, round_updates=2),
+            trainer=DAggerConfig(rounds=1, num_envs=2, cloning_steps=10, cloning_updates=2, updates_per_round=2),
             evaluation=EvaluationConfig(num_flocks=2, steps=4),
             runs=str(tmp_path),
         )
@@ -236,7 +236,7 @@ def test_an_installed_package_brings_models(own_names: None, monkeypatch: pytest
 @torch.no_grad()
 def test_gcn_is_linear_inside_the_ball() -> None:
     policy = make_model("gcn", hops=2, max_speed=1e6, seed=0).double()
-    observation, adjacency = flight(0)
+    observation, adjacency = rollout(0)
     rest = act(policy, 0 * observation, adjacency)
     once = act(policy, observation, adjacency) - rest
     torch.testing.assert_close(act(policy, 3 * observation, adjacency) - rest, 3 * once)
@@ -255,7 +255,7 @@ def test_pair_force_reads_the_receivers_own_velocity() -> None:
 
 @torch.no_grad()
 def test_renamed_keys_serve_every_model() -> None:
-    observation, adjacency = flight(0)
+    observation, adjacency = rollout(0)
     for name in MODELS:
         policy = build(name, seed=0, observation="state", adjacency="graph", action="u").double()
         with set_recurrent_mode(True):
@@ -267,7 +267,7 @@ def test_renamed_keys_serve_every_model() -> None:
 @torch.no_grad()
 def test_central_reads_all_agents_now_and_no_graph(seed: int) -> None:
     policy = build("central", agents=4, seed=seed, max_speed=100.0).double()
-    observation, adjacency = flight(seed, agents=4)
+    observation, adjacency = rollout(seed, agents=4)
     action = act(policy, observation, adjacency)
     torch.testing.assert_close(act(policy, observation, ~adjacency), action)
     layer = policy.layers[0]
@@ -281,7 +281,7 @@ def test_central_reads_all_agents_now_and_no_graph(seed: int) -> None:
 @torch.no_grad()
 def test_central_masks_agents_and_contains_nan() -> None:
     policy = build("central", agents=4, seed=0).double()
-    observation, adjacency = flight(0, agents=4)
+    observation, adjacency = rollout(0, agents=4)
     exists = torch.ones(2, 4, 4, dtype=torch.bool)
     exists[0, 1:, 2] = False
     sick = observation.clone()
@@ -297,7 +297,7 @@ def test_central_masks_agents_and_contains_nan() -> None:
 def test_central_serves_one_number_of_agents_and_says_so() -> None:
     policy = build("central", agents=4, seed=0).double()
     with pytest.raises(InputError, match="made for 4 agents was given 5"):
-        act(policy, *flight(0, agents=5))
+        act(policy, *rollout(0, agents=5))
     with pytest.raises(InputError, match="give num_agents"):
         make_model("central")
     with pytest.raises(InputError, match="one layer"):

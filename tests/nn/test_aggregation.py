@@ -19,7 +19,7 @@ from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.nn import aggregation, graph
 from modgnn_rl.nn.aggregation import Hop, aggregate
 from modgnn_rl.nn.communication import Adjacency, GraphAttention, Laplacian
-from modgnn_rl.nn.graph import Links
+from modgnn_rl.nn.graph import EdgeList
 from modgnn_rl.nn.topology import Topology
 
 seeds = st.integers(0, 999)
@@ -31,10 +31,10 @@ def numbers(*shape: int) -> Tensor:
     return torch.randn(*shape, dtype=torch.float64)
 
 
-def random_links(senders: int, receivers: int, share: float, **attributes: Tensor) -> Links:
+def random_links(senders: int, receivers: int, share: float, **attributes: Tensor) -> EdgeList:
     """Links between two different sets of nodes, some of which may have none."""
     receiver, sender = (torch.rand(receivers, senders) < share).nonzero().unbind(-1)
-    return Links(sender, receiver, senders, receivers, **attributes)
+    return EdgeList(sender, receiver, senders, receivers, **attributes)
 
 
 links = st.builds(
@@ -46,14 +46,14 @@ links = st.builds(
 )
 
 
-def held_by(links: Links, **own: Tensor) -> Hop:
+def held_by(links: EdgeList, **own: Tensor) -> Hop:
     rows = links.num_senders, links.num_receivers
     senders, receivers = (numbers(count, WIDTH).requires_grad_() for count in rows)
     return Hop(senders, receivers, {("own", name): value for name, value in own.items()})
 
 
 def results(
-    links: Links, f_com: nn.Module, f_pre: nn.Module, hop: Hop, kind: str, *, at_once: bool = False
+    links: EdgeList, f_com: nn.Module, f_pre: nn.Module, hop: Hop, kind: str, *, at_once: bool = False
 ) -> list[Tensor]:
     """The aggregate, and gradients for tables and weights; ``at_once`` by plain autograd over all links."""
     value = aggregate(links, f_com, f_pre, hop, kind, (lambda name, rows: None) if at_once else None)
@@ -118,7 +118,9 @@ MODULES: dict[str, Callable[[], tuple[nn.Module, nn.Module]]] = {
 @pytest.mark.parametrize("kind", graph.AGGREGATIONS)
 @settings(max_examples=8)
 @given(links=links, size=st.sampled_from([1, 4, 100]), stored=st.booleans())
-def test_blocks_stored_or_not_are_plain_autograd(name: str, kind: str, links: Links, size: int, stored: bool) -> None:
+def test_blocks_stored_or_not_are_plain_autograd(
+    name: str, kind: str, links: EdgeList, size: int, stored: bool
+) -> None:
     f_com, f_pre = (module.double() for module in MODULES[name]())
     role, arms = torch.randint(5, (links.num_receivers, 1)), numbers(links.num_receivers, 3, 2).requires_grad_()
     hop = held_by(links, role=role, arms=arms)
@@ -131,7 +133,7 @@ def test_blocks_stored_or_not_are_plain_autograd(name: str, kind: str, links: Li
 
 @few
 @given(links=links, size=st.sampled_from([1, 4, 100]))
-def test_frozen_weights_and_constant_data_have_no_gradient(links: Links, size: int) -> None:
+def test_frozen_weights_and_constant_data_have_no_gradient(links: EdgeList, size: int) -> None:
     f_com, f_pre = nn.Bilinear(WIDTH, WIDTH, WIDTH).double(), tanh_network()
     f_pre[0].requires_grad_(False)  # type: ignore[index]
     hop = held_by(links)
@@ -218,7 +220,7 @@ class _Pair(nn.Module):
         super().__init__()
         self.f_com, self.f_pre = f_com, f_pre
 
-    def forward(self, links: Links, hop: Hop, record=None) -> Tensor:
+    def forward(self, links: EdgeList, hop: Hop, record=None) -> Tensor:
         return aggregate(links, self.f_com, self.f_pre, hop, record=record)
 
 
@@ -274,7 +276,7 @@ def test_learned_weights_and_features_of_links_get_gradients(
     torch.manual_seed(0)
     bare = random_links(8, 7, 0.5)
     weight, feature = numbers(len(bare)).requires_grad_(), numbers(len(bare), 2).requires_grad_()
-    many = Links(bare.sender, bare.receiver, 8, 7, weight, feature)
+    many = EdgeList(bare.sender, bare.receiver, 8, 7, weight, feature)
     f_com = TensorDictModule(_Concatenated(), ["sender", ("link", "weight"), ("link", "feature")], ["y"])
     hop, f_pre = held_by(many), tanh_network(WIDTH + 3)
     at_once = aggregate(many, f_com, f_pre, hop, record=lambda name, rows: None)

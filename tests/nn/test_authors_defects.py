@@ -169,12 +169,12 @@ def test_moving_a_policy_returns_it() -> None:
 
 @torch.no_grad()
 def test_a_policy_holds_no_state_of_a_flight() -> None:
-    """They keep the messages on the module, so that one policy cannot serve two flights, or another batch size."""
-    policy, flights = make_policy(2), [random_data(STEPS), random_data(3, STEPS)]
+    """They keep the messages on the module, so that one policy cannot serve two rollouts, or another batch size."""
+    policy, rollouts = make_policy(2), [random_data(STEPS), random_data(3, STEPS)]
     stored = [None, None]
 
-    def fly(which: int, t: int) -> Tensor:
-        step = flights[which][..., t].clone()
+    def rollout(which: int, t: int) -> Tensor:
+        step = rollouts[which][..., t].clone()
         step["is_init"] = torch.full((*step.shape, 1), t == 0)
         if stored[which] is not None:
             step["messages"] = stored[which]
@@ -183,9 +183,9 @@ def test_a_policy_holds_no_state_of_a_flight() -> None:
         return step[ACTION]
 
     before = {name: value.clone() for name, value in policy.state_dict().items()}
-    interleaved = [[fly(which, t) for which in (0, 1)] for t in range(STEPS)]
-    for which, flight in enumerate(flights):
-        expected = run(policy, flight)
+    interleaved = [[rollout(which, t) for which in (0, 1)] for t in range(STEPS)]
+    for which, data in enumerate(rollouts):
+        expected = run(policy, data)
         torch.testing.assert_close(torch.stack([pair[which] for pair in interleaved], -3), expected)
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
 

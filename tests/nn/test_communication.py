@@ -21,7 +21,7 @@ from modgnn_rl.nn.communication import (
     MessagePassing,
     NormalizedAdjacency,
 )
-from modgnn_rl.nn.graph import Graph, Pairs
+from modgnn_rl.nn.graph import DenseGraph, Graph
 from modgnn_rl.nn.topology import Topology
 
 seeds = st.integers(0, 999)
@@ -42,8 +42,8 @@ def random_mask(*shape: int, agents: int = AGENTS, share: float = 0.5) -> Tensor
 def on_links(f_com: Communication, held: Tensor, mask: Tensor, form: str, **of_links: Tensor | None) -> Tensor:
     """Y of all pairs [G, N, N, D'], zero where there is no link, from what the agents hold [G, N, D]."""
     topology = Topology(mask, AGENTS, **of_links, form=form, keep_positions=True)
-    everyone, table = topology.everyone(), held.flatten(0, 1)
-    y = f_com(everyone.at_senders(table), everyone.at_receivers(table), everyone)
+    everyone, table = topology.all_edges(), held.flatten(0, 1)
+    y = f_com(everyone.gather_senders(table), everyone.gather_receivers(table), everyone)
     return topology.spread_links(y, everyone)
 
 
@@ -274,8 +274,8 @@ class _Nearer(Communication):
 
     def forward(self, sender: Tensor, receiver: Tensor, links: Graph) -> Tensor:
         loudness = links.softmax(-(sender - receiver).norm(dim=-1, keepdim=True))
-        mean = links.total(sender) / links.degree().clamp(min=1).unsqueeze(-1)
-        return loudness * (sender - links.at_receivers(mean))
+        mean = links.scatter_sum(sender) / links.degree().clamp(min=1).unsqueeze(-1)
+        return loudness * (sender - links.gather_receivers(mean))
 
 
 @few
@@ -378,7 +378,7 @@ def test_links_and_pairs_are_one(name: str, share: float, seed: int) -> None:
 
 def test_pairs_without_gradients_need_no_stand_ins() -> None:
     """The data of unlinked pairs are replaced for the sake of gradients only."""
-    table, pairs = numbers(3, 2), Pairs(torch.eye(3, dtype=torch.bool).unsqueeze(0))
+    table, pairs = numbers(3, 2), DenseGraph(torch.eye(3, dtype=torch.bool).unsqueeze(0))
     with torch.no_grad():
-        assert torch.equal(pairs.at_senders(table), table.repeat(3, 1))
-    assert torch.equal(pairs.at_senders(table)[1], table[0])
+        assert torch.equal(pairs.gather_senders(table), table.repeat(3, 1))
+    assert torch.equal(pairs.gather_senders(table)[1], table[0])

@@ -16,7 +16,7 @@ from modgnn_rl import ModGNNLayer
 from modgnn_rl.nn import fused, graph
 from modgnn_rl.nn.aggregation import Hop, aggregate
 from modgnn_rl.nn.communication import Adjacency, Laplacian
-from modgnn_rl.nn.graph import Links
+from modgnn_rl.nn.graph import EdgeList
 from modgnn_rl.nn.topology import Topology
 
 seeds = st.integers(0, 999)
@@ -28,10 +28,10 @@ def numbers(*shape: int) -> Tensor:
     return torch.randn(*shape, dtype=torch.float64)
 
 
-def random_links(senders: int, receivers: int, share: float, **attributes: Tensor) -> Links:
+def random_links(senders: int, receivers: int, share: float, **attributes: Tensor) -> EdgeList:
     """Links between two different sets of nodes, some of which may have none."""
     receiver, sender = (torch.rand(receivers, senders) < share).nonzero().unbind(-1)
-    return Links(sender, receiver, senders, receivers, **attributes)
+    return EdgeList(sender, receiver, senders, receivers, **attributes)
 
 
 links = st.builds(
@@ -43,14 +43,14 @@ links = st.builds(
 )
 
 
-def held_by(links: Links, **own: Tensor) -> Hop:
+def held_by(links: EdgeList, **own: Tensor) -> Hop:
     rows = links.num_senders, links.num_receivers
     senders, receivers = (numbers(count, WIDTH).requires_grad_() for count in rows)
     return Hop(senders, receivers, {("own", name): value for name, value in own.items()})
 
 
 def results(
-    links: Links, f_com: nn.Module, f_pre: nn.Module, hop: Hop, kind: str, *, at_once: bool = False
+    links: EdgeList, f_com: nn.Module, f_pre: nn.Module, hop: Hop, kind: str, *, at_once: bool = False
 ) -> list[Tensor]:
     """The aggregate, and gradients for tables and weights; ``at_once`` by plain autograd over all links."""
     value = aggregate(links, f_com, f_pre, hop, kind, (lambda name, rows: None) if at_once else None)
@@ -116,7 +116,7 @@ networks = st.builds(
 @pytest.mark.parametrize("kind", ["sum", "mean"])
 @settings(max_examples=60)
 @given(f_pre=networks, links=links, size=st.sampled_from([1, 4, 100]))
-def test_rewrites_are_exact(f_com: nn.Module, kind: str, f_pre: nn.Module, links: Links, size: int) -> None:
+def test_rewrites_are_exact(f_com: nn.Module, kind: str, f_pre: nn.Module, links: EdgeList, size: int) -> None:
     hop = held_by(links)
     expected = results(links, f_com, f_pre, hop, kind, at_once=True)
     assert fused.rewrite(links, f_com, f_pre) is not None
@@ -191,7 +191,7 @@ def test_other_modules_are_not_rewritten(name: str, small_blocks: Callable[[int]
 def test_weighted_links_and_autocast_are_not_rewritten() -> None:
     bare = random_links(6, 5, 0.5)
     f_pre = nn.Sequential(nn.Linear(WIDTH, 4), nn.ReLU(), nn.Linear(4, 2))
-    weighted = Links(bare.sender, bare.receiver, 6, 5, torch.ones(len(bare)))
+    weighted = EdgeList(bare.sender, bare.receiver, 6, 5, torch.ones(len(bare)))
     assert fused.rewrite(bare, Laplacian(), f_pre) is not None
     assert fused.rewrite(weighted, Laplacian(), f_pre) is None
     with torch.autocast("cpu", torch.bfloat16):

@@ -15,7 +15,7 @@ from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn import graph, topology
 from modgnn_rl.nn.communication import MessagePassing
-from modgnn_rl.nn.graph import Links, Pairs
+from modgnn_rl.nn.graph import DenseGraph, EdgeList
 from modgnn_rl.nn.topology import Topology
 
 seeds = st.integers(0, 999)
@@ -35,13 +35,13 @@ def numbers(*shape: int) -> Tensor:
     return torch.randn(*shape, dtype=torch.float64)
 
 
-def links_of(mask: Tensor, **attributes: Tensor) -> Links:
+def links_of(mask: Tensor, **attributes: Tensor) -> EdgeList:
     """The links of a mask [G, R, S], written down one after the other."""
     graphs, receivers, senders = mask.shape
     entries = [(g * senders + j, g * receivers + i) for g, i, j in mask.nonzero().tolist()]
     sender, receiver = torch.tensor(entries, dtype=torch.long).view(-1, 2).unbind(-1)
     chosen = {name: value[mask] for name, value in attributes.items()}
-    return Links(sender, receiver, graphs * senders, graphs * receivers, **chosen)
+    return EdgeList(sender, receiver, graphs * senders, graphs * receivers, **chosen)
 
 
 def neighbourhoods(mask: Tensor) -> list[list[int]]:
@@ -71,15 +71,15 @@ def in_pairs(values: Tensor, mask: Tensor, elsewhere: float = torch.nan) -> Tens
 @few
 @given(mask=masks)
 def test_ends_of_the_links(mask: Tensor) -> None:
-    links, pairs = links_of(mask), Pairs(mask)
+    links, pairs = links_of(mask), DenseGraph(mask)
     graphs, receivers, senders = mask.shape
     of_senders, of_receivers = numbers(graphs * senders, 2, 3), numbers(graphs * receivers)
     ends = [(of_senders[g * senders + j], of_receivers[g * receivers + i]) for g, i, j in mask.nonzero().tolist()]
     expected = [torch.stack(side) if ends else None for side in zip(*ends, strict=True)] or [None, None]
     linked = mask.flatten()
     for found, side in (
-        ((links.at_senders(of_senders), pairs.at_senders(of_senders)[linked]), expected[0]),
-        ((links.at_receivers(of_receivers), pairs.at_receivers(of_receivers)[linked]), expected[1]),
+        ((links.gather_senders(of_senders), pairs.gather_senders(of_senders)[linked]), expected[0]),
+        ((links.gather_receivers(of_receivers), pairs.gather_receivers(of_receivers)[linked]), expected[1]),
     ):
         for one in found:
             assert len(one) == len(ends)
@@ -103,7 +103,7 @@ def test_aggregates_and_their_gradients(mask: Tensor, aggregation: str) -> None:
     (gradient,) = torch.autograd.grad((expected * weights).sum(), values, materialize_grads=True)
     for found in (
         links_of(mask).aggregate(values, aggregation),
-        Pairs(mask).aggregate(in_pairs(values, mask), aggregation),
+        DenseGraph(mask).aggregate(in_pairs(values, mask), aggregation),
     ):
         torch.testing.assert_close(found, expected)
         (ours,) = torch.autograd.grad((found * weights).sum(), values, materialize_grads=True)
@@ -119,7 +119,7 @@ def test_softmax_and_its_gradient(mask: Tensor, offset: float, rubbish: float) -
     parts = [logits[found].softmax(0) for found in neighbourhoods(mask) if found]
     expected = torch.cat(parts) if parts else logits * 0.0
     (gradient,) = torch.autograd.grad((expected * weights).sum(), logits)
-    pairs = Pairs(mask)
+    pairs = DenseGraph(mask)
     everywhere = in_pairs(logits, mask, rubbish)
     of_pairs = pairs.only_linked(pairs.softmax(everywhere))[mask.flatten()]
     for found in (links_of(mask).softmax(logits), of_pairs):
@@ -140,7 +140,7 @@ def test_links_between_some(mask: Tensor, seed: int, share: float) -> None:
     links = links_of(mask, weight=weight, feature=feature).between(of_senders.flatten(), of_receivers.flatten())
     assert torch.equal(links.sender, expected.sender)
     assert torch.equal(links.receiver, expected.receiver)
-    pairs = Pairs(mask, weight, feature).between(of_senders.flatten(), of_receivers.flatten())
+    pairs = DenseGraph(mask, weight, feature).between(of_senders.flatten(), of_receivers.flatten())
     assert torch.equal(pairs.mask, kept)
     assert (links.num_senders, links.num_receivers) == (pairs.num_senders, pairs.num_receivers)
     for name in ("weight", "feature"):
@@ -170,8 +170,8 @@ def test_blocks_hold_whole_neighbourhoods_and_make_the_whole(size: int, mask: Te
         assert links.weight is not None
         assert torch.equal(block.weight, links.weight[part])
         assert len(block) <= size + max(links.degree().tolist(), default=0)
-        totals.append(block.total(values[part]))
-    torch.testing.assert_close(torch.cat(totals), links.total(values))
+        totals.append(block.scatter_sum(values[part]))
+    torch.testing.assert_close(torch.cat(totals), links.scatter_sum(values))
 
 
 # What a user gives.
@@ -303,7 +303,7 @@ def test_few_agents_most_of_which_are_linked_are_worked_on_in_pairs() -> None:
 )
 def test_what_is_no_graph_is_refused(form: str, adjacency: Tensor, of_links: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Topology(adjacency, 4, **of_links, form=form).everyone()
+        Topology(adjacency, 4, **of_links, form=form).all_edges()
 
 
 def test_an_unknown_form_is_refused() -> None:
@@ -336,8 +336,8 @@ def test_a_graph_for_other_data_is_refused(form: str) -> None:
 
 def test_the_form_says_what_kind_of_graph_an_f_com_sees() -> None:
     adjacency = torch.ones(1, 2, 2, dtype=torch.bool)
-    for form, kind in (("links", Links), ("pairs", Pairs)):
-        everyone = Topology(adjacency, 2, form=form).everyone()
+    for form, kind in (("links", EdgeList), ("pairs", DenseGraph)):
+        everyone = Topology(adjacency, 2, form=form).all_edges()
         assert isinstance(everyone, kind)
         assert everyone.weight is None
         assert everyone.feature is None

@@ -320,7 +320,7 @@ def test_an_f_com_of_its_own_for_each_hop() -> None:
         ends = before.unsqueeze(1).expand(-1, AGENTS, -1, -1), before.unsqueeze(2).expand(-1, -1, AGENTS, -1)
         if hop == 2:  # attention, see its own tests
             topology = Topology(data["adjacency"], AGENTS, form="pairs")
-            y = f_com[1](*(end.flatten(0, 2) for end in ends), topology.everyone()).view(6, AGENTS, AGENTS, -1)
+            y = f_com[1](*(end.flatten(0, 2) for end in ends), topology.all_edges()).view(6, AGENTS, AGENTS, -1)
         else:
             y = f_com[hop - 1](*(end.contiguous() for end in ends))
         held = torch.where(data["adjacency"].unsqueeze(-1), y, 0.0).sum(2)

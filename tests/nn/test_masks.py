@@ -74,17 +74,17 @@ def run(policy: ModGNN, data: TensorDict) -> tuple[Tensor, Tensor]:
     return out["agents", "action"], out["next", "messages"]
 
 
-def padded(flights: list[TensorDict], size: int, rubbish: float) -> TensorDict:
+def padded(rollouts: list[TensorDict], size: int, rubbish: float) -> TensorDict:
     """Flocks of different size in one batch: rubbish data, and links all over what does not exist."""
     filled = []
-    for flight in flights:
-        agents = flight["adjacency"].shape[-1]
-        data = TensorDict({"is_init": flight["is_init"]}, [STEPS])
+    for rollout in rollouts:
+        agents = rollout["adjacency"].shape[-1]
+        data = TensorDict({"is_init": rollout["is_init"]}, [STEPS])
         observation = torch.full((STEPS, size, FEATURES), rubbish, dtype=torch.float64)
-        data["agents", "observation"] = torch.cat((flight["agents", "observation"], observation[:, agents:]), 1)
+        data["agents", "observation"] = torch.cat((rollout["agents", "observation"], observation[:, agents:]), 1)
         data["agents", "mask"] = (torch.arange(size) < agents).expand(STEPS, -1)
         for name, fill in (("adjacency", True), ("weight", rubbish), ("feature", rubbish)):
-            value = flight[name]
+            value = rollout[name]
             data[name] = value.new_full((STEPS, size, size, *value.shape[3:]), fill)
             data[name][:, :agents, :agents] = value
         filled.append(data)
@@ -106,15 +106,15 @@ def test_a_flock_in_a_padded_batch_is_as_it_is_alone(
 ) -> None:
     torch.manual_seed(seed)
     policy = make_policy(hops, start, kind, form)
-    flights = [random_flight(STEPS, agents=agents) for agents in sizes]
-    observations = [flight["agents", "observation"].requires_grad_() for flight in flights]
-    together = padded(flights, 4, rubbish)
+    rollouts = [random_flight(STEPS, agents=agents) for agents in sizes]
+    observations = [rollout["agents", "observation"].requires_grad_() for rollout in rollouts]
+    together = padded(rollouts, 4, rubbish)
     action, messages = run(policy, together)
     wanted = (*observations, *policy.parameters())
     expected = torch.zeros(())
     ours = torch.autograd.grad(action.square().sum(), wanted, materialize_grads=True, allow_unused=True)
-    for number, (flight, agents) in enumerate(zip(flights, sizes, strict=True)):
-        alone, sent = run(policy, flight)
+    for number, (rollout, agents) in enumerate(zip(rollouts, sizes, strict=True)):
+        alone, sent = run(policy, rollout)
         torch.testing.assert_close(action[number, :, :agents], alone)
         torch.testing.assert_close(messages[number, :, :agents], sent, equal_nan=True)
         assert not action[number, :, agents:].any()

@@ -340,7 +340,7 @@ def test_a_step_in_mid_flight_without_messages_warns() -> None:
         warnings.simplefilter("error")
         policies()["full"](data.clone())
     data["is_init"][1] = False
-    with pytest.warns(UserWarning, match="no 'messages' in mid-flight"):
+    with pytest.warns(UserWarning, match="no 'messages' in mid-rollout"):
         policies()["full"](data)
 
 

@@ -21,7 +21,7 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import LocalReynolds
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.registry import make_model
-from modgnn_rl.nn.primer import AgentCache, missing
+from modgnn_rl.nn.primer import RecurrentStatePrimer, missing
 
 FLOCKS, AGENTS = 3, 4
 ACTION = ("agents", "action")
@@ -45,7 +45,7 @@ policies = pytest.mark.parametrize("make", POLICIES.values(), ids=POLICIES.keys(
 
 
 def flocking(agents: int = AGENTS, max_steps: int = 7) -> FlockingEnv:
-    """Flocks whose episodes end at different steps."""
+    """FlockBuffer whose episodes end at different steps."""
     return FlockingEnv(FLOCKS, agents, seed=2, max_steps=max_steps, stagger=True)
 
 
@@ -82,9 +82,9 @@ def _seed() -> None:
 def test_a_collector_carries_messages_over_its_batches(make: Callable[[], ModGNN]) -> None:
     policy = make()
     batches = collect(policy, steps=5, batches=3)
-    flights = joined(batches)
-    begins = flights["is_init"].squeeze(-1)
-    messages, sent = flights["messages"], flights["next", "messages"]
+    rollouts = joined(batches)
+    begins = rollouts["is_init"].squeeze(-1)
+    messages, sent = rollouts["messages"], rollouts["next", "messages"]
     carried = ~begins[:, 1:]
     torch.testing.assert_close(messages[:, 1:][carried], sent[:, :-1][carried], equal_nan=True)
     assert not messages[begins].any()
@@ -96,9 +96,9 @@ def test_a_collector_carries_messages_over_its_batches(make: Callable[[], ModGNN
     assert begins[:, 1:].any()
 
     # All batches are one window that begins with an episode, and each is a window that continues from its messages.
-    bare = flights.exclude("messages", "next", ACTION)
+    bare = rollouts.exclude("messages", "next", ACTION)
     with set_recurrent_mode(True):
-        torch.testing.assert_close(policy(bare)[ACTION], flights[ACTION])
+        torch.testing.assert_close(policy(bare)[ACTION], rollouts[ACTION])
         for batch in batches:
             torch.testing.assert_close(policy(batch.exclude("next", ACTION))[ACTION], batch[ACTION])
 
@@ -118,12 +118,12 @@ def test_without_memory_the_window_would_differ(make: Callable[[], ModGNN]) -> N
 @torch.no_grad()
 def test_a_rollout_with_the_primer_is_a_window(make: Callable[[], ModGNN]) -> None:
     policy = make()
-    flights = remembering(policy).rollout(12, policy, break_when_any_done=False)
-    assert flights["is_init"].sum() > FLOCKS
+    rollouts = remembering(policy).rollout(12, policy, break_when_any_done=False)
+    assert rollouts["is_init"].sum() > FLOCKS
     with set_recurrent_mode(True):
-        window = policy(flights.exclude("messages", "next", ACTION))
-    torch.testing.assert_close(window[ACTION], flights[ACTION])
-    torch.testing.assert_close(window["next", "messages"], flights["next", "messages"], equal_nan=True)
+        window = policy(rollouts.exclude("messages", "next", ACTION))
+    torch.testing.assert_close(window[ACTION], rollouts[ACTION])
+    torch.testing.assert_close(window["next", "messages"], rollouts["next", "messages"], equal_nan=True)
 
 
 @pytest.mark.parametrize("collected", [True, False])
@@ -131,15 +131,15 @@ def test_a_rollout_with_the_primer_is_a_window(make: Callable[[], ModGNN]) -> No
 def test_local_reynolds_remembers_the_last_observation(collected: bool) -> None:
     expert = LocalReynolds(hops=2, action=ACTION)
     if collected:
-        flights = joined(collect(expert, steps=5, batches=3))
+        rollouts = joined(collect(expert, steps=5, batches=3))
     else:
-        flights = remembering(expert).rollout(12, expert, break_when_any_done=False)
-    observation, begins = flights["agents", "observation"], flights["is_init"].squeeze(-1)
+        rollouts = remembering(expert).rollout(12, expert, break_when_any_done=False)
+    observation, begins = rollouts["agents", "observation"], rollouts["is_init"].squeeze(-1)
     assert begins[:, 1:].any()
-    assert not flights[ACTION][begins].any()
-    assert flights[ACTION][~begins].any(-1).any(-1).all()
+    assert not rollouts[ACTION][begins].any()
+    assert rollouts[ACTION][~begins].any(-1).any(-1).all()
     carried = ~begins[:, 1:]
-    assert torch.equal(flights["last_observation"][:, 1:][carried], observation[:, :-1][carried])
+    assert torch.equal(rollouts["last_observation"][:, 1:][carried], observation[:, :-1][carried])
 
 
 @policies
@@ -164,10 +164,10 @@ def test_one_policy_flies_flocks_of_any_size() -> None:
 @torch.no_grad()
 def test_a_policy_without_messages_flies_in_the_same_environments() -> None:
     policy = make_model("central", num_agents=AGENTS, seed=0)
-    flights = remembering(policy).rollout(9, policy, break_when_any_done=False)
-    assert flights["messages"].shape == (FLOCKS, 9, AGENTS, 0, 6)
+    rollouts = remembering(policy).rollout(9, policy, break_when_any_done=False)
+    assert rollouts["messages"].shape == (FLOCKS, 9, AGENTS, 0, 6)
     (batch,) = collect(policy, steps=9, batches=1)
-    torch.testing.assert_close(batch[ACTION], flights[ACTION])
+    torch.testing.assert_close(batch[ACTION], rollouts[ACTION])
 
 
 @torch.no_grad()
@@ -178,11 +178,11 @@ def test_every_key_of_the_memory_may_be_renamed() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env.append_transform(policy.make_tensordict_primer())
-        flights = env.rollout(9, policy, break_when_any_done=False)
+        rollouts = env.rollout(9, policy, break_when_any_done=False)
     expected = remembering(make_model("modgnn_mlp", seed=0))
     plain = expected.rollout(9, make_model("modgnn_mlp", seed=0), break_when_any_done=False)
-    torch.testing.assert_close(flights[ACTION], plain[ACTION])
-    assert flights["memory"].any()
+    torch.testing.assert_close(rollouts[ACTION], plain[ACTION])
+    assert rollouts["memory"].any()
 
 
 def test_a_policy_that_cannot_run_on_what_the_environment_emits_is_refused() -> None:
@@ -238,18 +238,18 @@ class _Counter(TensorDictModuleBase):
         tensordict[ACTION] = torch.zeros_like(observation[..., :3])
         return tensordict.set(("next", "steps"), steps).set(("next", "first"), observation[..., 0, :])
 
-    def make_tensordict_primer(self) -> AgentCache:
-        return AgentCache(self, ["steps", "first"])
+    def make_tensordict_primer(self) -> RecurrentStatePrimer:
+        return RecurrentStatePrimer(self, ["steps", "first"])
 
 
 def test_any_module_may_keep_states_of_any_shape_and_type() -> None:
-    flights = joined(collect(_Counter(), steps=4, batches=3))
-    assert flights["first"].shape == (FLOCKS, 12, 6)
-    assert flights["next", "steps"].dtype == torch.long
+    rollouts = joined(collect(_Counter(), steps=4, batches=3))
+    assert rollouts["first"].shape == (FLOCKS, 12, 6)
+    assert rollouts["next", "steps"].dtype == torch.long
     expected = torch.zeros(FLOCKS, dtype=torch.long)
     for t in range(12):
-        expected = torch.where(flights["is_init"][:, t, 0], 0, expected) + 1
-        assert torch.equal(flights["next", "steps"][:, t, 0], expected)
+        expected = torch.where(rollouts["is_init"][:, t, 0], 0, expected) + 1
+        assert torch.equal(rollouts["next", "steps"][:, t, 0], expected)
 
 
 def test_missing_is_nan_of_the_same_kind() -> None:

@@ -24,8 +24,9 @@ from modgnn_rl.reproduction.tasks import Outcome, run_cells
 from modgnn_rl.tracking.loading import load_policy
 
 TINY = ScaleConfig(
-    name="tiny", episodes=4, steps=30, held_out=2, updates=6, batch_size=4, flocks=2, flight_steps=8, sizes=[32],
-    rounds=1, iterations=1, num_envs=2, study_updates=4, study_flocks=2, study_steps=8, study_sizes=[4, 32],
+    name="tiny", episodes=4, steps=30, val_episodes=2, updates=6, batch_size=4, eval_episodes=2, eval_steps=8,
+    sizes=[32], dagger_rounds=1, mappo_rounds=1, num_envs=2, study_updates=4,
+    study_episodes=2, study_steps=8, study_sizes=[4, 32],
 )  # fmt: skip
 WORLD = World("N32", 32, 2, 8)
 
@@ -68,9 +69,9 @@ def test_started_again_it_makes_what_is_missing_and_nothing_else(reproduction):
 def test_the_references_have_the_errors_that_they_must_have(reproduction):
     _, config, study, outcome = reproduction
     measured = Measurements(outcome, config, study)
-    for world in (VALIDATION, "N32"):
+    for env_config in (VALIDATION, "N32"):
         expert, local, idle = (
-            measured.values(name, world, "error") for name in ("expert", "LocalReynolds(hops=1)", "zero action")
+            measured.values(name, env_config, "error") for name in ("expert", "LocalReynolds(hops=1)", "zero action")
         )
         assert expert.max() == 0
         assert (idle <= config.env.max_speed**2 / 3 + 1e-6).all()
@@ -83,15 +84,15 @@ def test_validation_is_the_error_of_a_policy_that_looks_on(reproduction):
     """An independent way to the same number: step by step, the policy's action written beside the expert's."""
     from tensordict import TensorDict
 
-    from modgnn_rl.data.dataset import FlightDataset
+    from modgnn_rl.data.dataset import EpisodeDataset
 
     folder, config, study, outcome = reproduction
     policy = load_policy(folder / outcome.results["tables-cloning-gcn-K12-seed0"]["policies"]["gcn-K2"])
-    dataset = FlightDataset.open(folder / "dataset")
+    dataset = EpisodeDataset.open(folder / "dataset")
     state = None
     errors = []
     for step in range(dataset.steps):
-        now = dataset.windows(torch.tensor([4 * dataset.steps + step]), 1)[:, 0]  # the first held-out flight
+        now = dataset.windows(torch.tensor([4 * dataset.steps + step]), 1)[:, 0]  # the first held-out rollout
         messages = {} if state is None else dict(state["next"].items())
         seen = policy(TensorDict({**now.to_dict(), **messages}, now.batch_size))
         difference = seen["agents", "action"] - now["agents", "expert_action"]
@@ -159,20 +160,20 @@ def test_the_papers_figures_are_in_the_package():
 
 
 class Paper:
-    """Measurements that say what the paper's tables say: every flight of a row has the paper's mean."""
+    """Measurements that say what the paper's tables say: every rollout of a row has the paper's mean."""
 
     config = ReproduceConfig(seeds=3)
 
-    def values(self, row, world, figure):  # noqa: D102
-        if world == VALIDATION:
+    def values(self, row, env_config, figure):  # noqa: D102
+        if env_config == VALIDATION:
             entry = published()["validation_loss"][row.model][row.hops]
-        elif world == "N32":
+        elif env_config == "N32":
             there = published()["model_evaluation"][row.model][row.hops]
             name, _, part = figure.partition("_s")
             mean, deviation = (there["error"], 0.0) if figure == "error" else there[name]
             entry = {"pread": deviation, "quare": mean**2 + deviation**2}.get(part, mean)
         else:
-            entry = published()["generalization"][row.model][row.hops][int(world[1:])]
+            entry = published()["generalization"][row.model][row.hops][int(env_config[1:])]
         return np.full((3, 5), entry)
 
 
@@ -188,11 +189,11 @@ def test_margins_of_the_papers_own_figures_are_those_in_its_text():
 
 
 def test_a_claim_is_reversed_undecided_or_not_measured():
-    flights = {"gcn": [[1.0, 2, 3, 4, 5, 6]], "no_mid": [[2.0, 3, 4, 5, 6, 7]], "no_pre": [[2.0, 1, 4, 3, 6, 5]]}
+    rollouts = {"gcn": [[1.0, 2, 3, 4, 5, 6]], "no_mid": [[2.0, 3, 4, 5, 6, 7]], "no_pre": [[2.0, 1, 4, 3, 6, 5]]}
 
     class Made:
-        def values(self, row, world, figure):
-            found = flights.get(row.model)
+        def values(self, row, env_config, figure):
+            found = rollouts.get(row.model)
             return None if found is None else np.array(found)
 
     def word(*pairs):

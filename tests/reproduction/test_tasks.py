@@ -49,7 +49,7 @@ def test_what_is_gone_is_made_again_where_something_left_needs_it(tmp_path):
 
         return Cell(name, work, needs=needs, is_there=lambda result: (tmp_path / f"{name}.made").exists())
 
-    work = [making("data"), making("policy", ("data",)), counting(calls, "flight", 1, ("policy",))]
+    work = [making("data"), making("policy", ("data",)), counting(calls, "rollout", 1, ("policy",))]
     first = run_cells(tmp_path, work)
     for file in tmp_path.glob("*.made"):
         file.unlink()
@@ -60,7 +60,7 @@ def test_what_is_gone_is_made_again_where_something_left_needs_it(tmp_path):
     assert again.seconds == first.seconds
     more = run_cells(tmp_path, [*work, counting(calls, "another", 2, ("policy",))])
     assert calls == ["data", "policy", "another"]
-    assert more.results.keys() == {"data", "policy", "flight", "another"}
+    assert more.results.keys() == {"data", "policy", "rollout", "another"}
 
 
 def test_what_is_made_again_and_not_finished_is_not_done(tmp_path):

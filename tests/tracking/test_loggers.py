@@ -24,13 +24,13 @@ from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment import training
 from modgnn_rl.tracking.backends import Dashboard
-from modgnn_rl.tracking.loggers import Dashboards, check_logger, make_logger
+from modgnn_rl.tracking.loggers import LoggerGroup, check_logger, make_logger
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
 
 
 def config(logger, **wandb):
-    """A run that logs to these dashboards."""
+    """A run that logs to these loggers."""
     return TrainConfig(trainer=DAggerConfig(), logger=logger, wandb=WandbConfig(**wandb))
 
 
@@ -78,32 +78,32 @@ for method in ("log", "log_histogram", "log_video", "log_table", "log_references
     setattr(Fake, method, functools.partialmethod(Fake._call, method))
 
 
-def everything(dashboards):
+def everything(loggers):
     """Call each method once."""
-    dashboards.log(1, {"error": 0.5})
-    dashboards.log_histogram(1, "actions", torch.tensor([0.0, math.nan, 1.0, math.inf]))
-    dashboards.log_video(1, "flight", Path("flight.mp4"))
-    dashboards.log_table("rows", ["who", "error"], [["expert", 0.0]])
-    dashboards.log_references(1, {"error": {"expert": 0.0}})
+    loggers.log(1, {"error": 0.5})
+    loggers.log_histogram(1, "actions", torch.tensor([0.0, math.nan, 1.0, math.inf]))
+    loggers.log_video(1, "rollout", Path("rollout.mp4"))
+    loggers.log_table("rows", ["who", "error"], [["expert", 0.0]])
+    loggers.log_references(1, {"error": {"expert": 0.0}})
 
 
 def test_none_does_nothing(run):
     before = sorted(run.path.iterdir())
     for logger in ("none", []):
-        dashboards = make_logger(config(logger), run)
-        assert not dashboards
-        everything(dashboards)
-        assert dashboards.close() == []
+        loggers = make_logger(config(logger), run)
+        assert not loggers
+        everything(loggers)
+        assert loggers.close() == []
     assert sorted(run.path.iterdir()) == before
 
 
 def test_csv_lies_in_the_run_folder(run):
-    dashboards = make_logger(config("csv"), run)
-    assert not dashboards.shows_videos
-    everything(dashboards)
-    dashboards.log(3, {"train/error": 0.5})
-    dashboards.log(4, {"train/error": float("nan")})
-    assert dashboards.close() == [f"csv: {run.path}/csv"]
+    loggers = make_logger(config("csv"), run)
+    assert not loggers.shows_videos
+    everything(loggers)
+    loggers.log(3, {"train/error": 0.5})
+    loggers.log(4, {"train/error": float("nan")})
+    assert loggers.close() == [f"csv: {run.path}/csv"]
     assert (run.path / "csv/scalars/train/error.csv").read_text() == "3,0.5\n4,nan\n"
     assert (run.path / "csv/tables/rows.csv").read_text() == "who,error\nexpert,0.0\n"
     settings = (run.path / "csv/texts/hparams0.txt").read_text().splitlines()
@@ -115,9 +115,9 @@ def test_tensorboard_holds_everything_and_a_run_for_each_reference(run, tmp_path
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    dashboards = make_logger(config("tensorboard"), run)
-    everything(Dashboards({"tensorboard": lambda: _without_film(dashboards)}))
-    assert dashboards.close() == [f"tensorboard --logdir {run.path}/tensorboard"]
+    loggers = make_logger(config("tensorboard"), run)
+    everything(LoggerGroup({"tensorboard": lambda: _without_film(loggers)}))
+    assert loggers.close() == [f"tensorboard --logdir {run.path}/tensorboard"]
     (own, expert) = (EventAccumulator(str(run.path / "tensorboard" / name)).Reload() for name in ("", "expert"))
     assert [(event.step, event.value) for event in own.Scalars("error")] == [(1, 0.5)]
     assert [(event.step, event.value) for event in expert.Scalars("error")] == [(1, 0.0)]
@@ -131,20 +131,20 @@ def test_tensorboard_holds_everything_and_a_run_for_each_reference(run, tmp_path
     assert "made_with.torchrl|" in settings
 
 
-def _without_film(dashboards):
+def _without_film(loggers):
     """The first dashboard, but for films: there is none here to show."""
-    dashboard = next(iter(dashboards._dashboards.values()))
+    dashboard = next(iter(loggers._dashboards.values()))
     dashboard.log_video = lambda *_: None
     return dashboard
 
 
 def test_working_dashboards_are_passed_everything():
     fakes = {"one": Fake(), "other": Fake()}
-    dashboards = Dashboards({name: lambda fake=fake: fake for name, fake in fakes.items()})
-    everything(dashboards)
-    assert dashboards.shows_videos
-    assert dashboards.close() == ["fake: somewhere"] * 2
-    assert dashboards.close() == []
+    loggers = LoggerGroup({name: lambda fake=fake: fake for name, fake in fakes.items()})
+    everything(loggers)
+    assert loggers.shows_videos
+    assert loggers.close() == ["fake: somewhere"] * 2
+    assert loggers.close() == []
     for fake in fakes.values():
         assert fake.calls[0] == ("log", 1, {"error": 0.5})
         assert fake.calls[1][3].tolist() == [0.0, 1.0]  # what is finite
@@ -157,11 +157,11 @@ def test_the_first_failure_turns_a_dashboard_off_with_one_warning_and_the_others
     fake, other = Fake(broken), Fake()
 
     def use():
-        dashboards = Dashboards({"fake": lambda: fake, "other": lambda: other})
+        loggers = LoggerGroup({"fake": lambda: fake, "other": lambda: other})
         for _ in range(3):
-            everything(dashboards)
-        assert dashboards.close() == ["fake: somewhere"]
-        everything(dashboards)
+            everything(loggers)
+        assert loggers.close() == ["fake: somewhere"]
+        everything(loggers)
 
     with pytest.warns(RuntimeWarning) as caught:
         use()
@@ -174,12 +174,12 @@ def test_the_first_failure_turns_a_dashboard_off_with_one_warning_and_the_others
 
 def test_a_dashboard_that_hangs_is_left_alone():
     fake = Fake("log", seconds=5.0)
-    dashboards = Dashboards({"fake": lambda: fake}, patience=0.1)
+    loggers = LoggerGroup({"fake": lambda: fake}, patience=0.1)
     began = time.monotonic()
     with pytest.warns(RuntimeWarning, match=r"off \(no answer within 0.1 s\)"):
-        dashboards.log(1, {"error": 0.5})
+        loggers.log(1, {"error": 0.5})
     assert time.monotonic() - began < 3
-    assert not dashboards
+    assert not loggers
 
 
 def test_a_dashboard_that_cannot_be_made_is_off_with_one_warning():
@@ -187,15 +187,15 @@ def test_a_dashboard_that_cannot_be_made_is_off_with_one_warning():
         raise PermissionError
 
     with pytest.warns(RuntimeWarning, match=r"off \(PermissionError\)") as caught:
-        dashboards = Dashboards({"fake": build})
+        loggers = LoggerGroup({"fake": build})
     assert len(caught) == 1
-    everything(dashboards)
-    assert dashboards.close() == []
+    everything(loggers)
+    assert loggers.close() == []
 
 
 def test_ctrl_c_is_not_swallowed():
     with pytest.raises(KeyboardInterrupt):
-        everything(Dashboards({"fake": lambda: Fake("log", error=KeyboardInterrupt())}))
+        everything(LoggerGroup({"fake": lambda: Fake("log", error=KeyboardInterrupt())}))
 
 
 @pytest.mark.parametrize(
@@ -284,18 +284,18 @@ def test_wandb_online_with_a_server_that_never_answers_is_offline(run, monkeypat
 
 @pytest.mark.usefixtures("clean_wandb")
 def test_wandb_holds_everything(run, tmp_path):
-    film = tmp_path / "flight.mp4"
+    film = tmp_path / "rollout.mp4"
     film.write_bytes(b"a film")
     for step, error in enumerate((0.5, math.nan, 0.25)):
         run.log(step, {"error": error})
-    dashboards = make_logger(config("wandb", group="mine"), run)
-    everything(Dashboards({"wandb": lambda: _without_film(dashboards)}))
-    dashboards = make_logger(config("wandb", group="mine"), run)
-    assert dashboards.shows_videos
-    dashboards.log_video(2, "flight", film)
-    dashboards.log_table("rows", ["who", "error"], [["expert", 0.0]])
-    dashboards.log_references(2, {"error": {"expert": 0.0, "zero action": 1.0}})
-    assert len(dashboards.close()) == 1
+    loggers = make_logger(config("wandb", group="mine"), run)
+    everything(LoggerGroup({"wandb": lambda: _without_film(loggers)}))
+    loggers = make_logger(config("wandb", group="mine"), run)
+    assert loggers.shows_videos
+    loggers.log_video(2, "rollout", film)
+    loggers.log_table("rows", ["who", "error"], [["expert", 0.0]])
+    loggers.log_references(2, {"error": {"expert": 0.0, "zero action": 1.0}})
+    assert len(loggers.close()) == 1
     folder = run.path / "wandb" / "latest-run" / "files" / "media"
     assert [path.read_bytes() for path in folder.rglob("*.mp4")] == [b"a film"]
     tables = {path.name.partition("_")[0]: json.loads(path.read_text()) for path in folder.rglob("*.table.json")}
@@ -358,9 +358,9 @@ def test_training_goes_on_without_wandb_and_metrics_are_complete(tmp_path, monke
         cloning_steps=8,
         cloning_updates=2,
         rounds=12,
-        round_steps=4,
-        round_updates=2,
-        held_out=1,
+        steps_per_round=4,
+        updates_per_round=2,
+        num_val_envs=1,
     )
     whole = TrainConfig(
         env=FlockingConfig(num_agents=4, max_steps=4),

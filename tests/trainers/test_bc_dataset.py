@@ -1,4 +1,4 @@
-"""Behaviour cloning on a dataset: never on the held-out flights, and never on a dataset that does not fit."""
+"""Behaviour cloning on a dataset: never on the held-out rollouts, and never on a dataset that does not fit."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
 )
 from modgnn_rl.data.collect import collect
-from modgnn_rl.data.dataset import FlightDataset, FlightWindows
+from modgnn_rl.data.dataset import EpisodeDataset, EpisodeWindows
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.imitation.learner import Learner
+from modgnn_rl.trainers.imitation.learner import ImitationLearner
 
 WORLD = FlockingConfig(num_agents=5)
 EPISODES, STEPS = 6, 30
@@ -45,7 +45,7 @@ def _without_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
 def run_bc(
     runs: Path, dataset: Path, *, env: FlockingConfig = WORLD, model: str = "pair_force", **settings: Any
 ) -> RunFolder:
-    small = {"batch_size": 16, "cloning_steps": 10, "cloning_updates": 20, "held_out": 2, "capacity": 10}
+    small = {"batch_size": 16, "cloning_steps": 10, "cloning_updates": 20, "num_val_envs": 2, "capacity": 10}
     trainer = BCConfig(dataset=str(dataset), **{**small, **settings})
     return train(
         TrainConfig(
@@ -59,14 +59,14 @@ def run_bc(
 
 def test_held_out_flights_are_not_trained_on(tmp_path: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: dict[range, set[int]] = {}
-    windows = FlightDataset.windows
+    windows = EpisodeDataset.windows
 
-    def watched(storage: FlightWindows, index: torch.Tensor) -> Any:
+    def watched(storage: EpisodeWindows, index: torch.Tensor) -> Any:
         absolute = index + storage.episodes.start * STEPS
         read.setdefault(storage.episodes, set()).update((absolute // STEPS).tolist())
         return windows(storage.dataset, absolute, storage.length)
 
-    monkeypatch.setattr(FlightWindows, "get", watched)
+    monkeypatch.setattr(EpisodeWindows, "get", watched)
     metrics = run_bc(tmp_path, dataset).read_metrics()
     assert read == {range(4): {0, 1, 2, 3}, range(4, 6): {4, 5}}
     assert len(metrics) == 20
@@ -76,8 +76,8 @@ def test_held_out_flights_are_not_trained_on(tmp_path: Path, dataset: Path, monk
 
 def test_a_learner_fits_a_dataset(dataset: Path) -> None:
     policy = make_model("modgnn_mlp", hops=2, seed=0)
-    buffer = FlightDataset.open(dataset).buffer(policy.window, 64, generator=torch.Generator().manual_seed(0))
-    learner = Learner(policy, BCConfig(averaging=0.9), (60, 60), seed=0)
+    buffer = EpisodeDataset.open(dataset).buffer(policy.window, 64, generator=torch.Generator().manual_seed(0))
+    learner = ImitationLearner(policy, BCConfig(ema_decay=0.9), (60, 60), seed=0)
     before = learner.validate(buffer)
     learner.fit(buffer, 60)
     assert learner.validate(buffer) < 0.5 * before
@@ -96,8 +96,8 @@ def test_one_seed_fixes_a_run_and_its_generators_are_kept(tmp_path: Path, datase
     [
         ({"env": FlockingConfig(num_agents=5, separation_gain=0.7)}, r"env.separation_gain=0.7 \(there 0.8\)"),
         ({"env": FlockingConfig(num_agents=[5, 6])}, r"env.num_agents=\[5, 6\] \(there 5\)"),
-        ({"held_out": 6}, r"held_out=6 leaves nothing to train on of the 6 episodes"),
-        ({"dataset": "nowhere"}, "nowhere is no dataset of flights"),
+        ({"num_val_envs": 6}, r"num_val_envs=6 leaves nothing to train on of the 6 episodes"),
+        ({"dataset": "nowhere"}, "nowhere is no dataset of rollouts"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_a_run_is_made(

@@ -14,13 +14,13 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation.rollout import fly
+from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
-from modgnn_rl.trainers.loop.setup import initial_policy, settle_model
+from modgnn_rl.trainers.loop.setup import initial_policy, resolve_model
 from modgnn_rl.trainers.mappo import anchor_weight
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 
@@ -33,7 +33,7 @@ def _without_evaluation(monkeypatch):
 
 
 def _config(runs, *, env=WORLD, model=None, init_from=None, seed=0, name=None, **settings):
-    small = {"num_envs": 1, "iterations": 3, "round_steps": 8, "critic_warmup": 1, "epochs": 2, "batches": 2}
+    small = {"num_envs": 1, "rounds": 3, "steps_per_round": 8, "critic_warmup": 1, "epochs": 2, "num_minibatches": 2}
     trainer = MAPPOConfig(**{**small, "critic_hidden": 8, "window": 3, **settings})
     models = {} if model is None else {"model": model}
     return TrainConfig(
@@ -46,7 +46,9 @@ def cloned(tmp_path_factory):
     """The run folder of a policy that was cloned a little."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "evaluate_policies", lambda *_, **__: {})
-        trainer = BCConfig(num_envs=1, batch_size=16, cloning_steps=20, cloning_updates=20, held_out=1, averaging=0.5)
+        trainer = BCConfig(
+            num_envs=1, batch_size=16, cloning_steps=20, cloning_updates=20, num_val_envs=1, ema_decay=0.5
+        )
         model = ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
         return train(
             TrainConfig(env=WORLD, model=model, trainer=trainer, runs=str(tmp_path_factory.mktemp("runs")), threads=1)
@@ -54,23 +56,23 @@ def cloned(tmp_path_factory):
 
 
 def _scores(policy):
-    flights = fly(policy, WORLD, num_agents=4, num_flocks=3, steps=12, seed=5)
-    return torch.cat((flights.error, flights.reward, flights.cohesion))
+    rollouts = rollout(policy, WORLD, num_agents=4, num_flocks=3, steps=12, seed=5)
+    return torch.cat((rollouts.error, rollouts.reward, rollouts.cohesion))
 
 
 def test_training_begins_with_exactly_the_policy_of_the_other_run(cloned, tmp_path):
-    config = settle_model(_config(tmp_path, init_from=str(cloned.path)))
+    config = resolve_model(_config(tmp_path, init_from=str(cloned.path)))
     policy, expected = initial_policy(config), _scores(load_policy(cloned.path))
     assert config.model == ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
     assert torch.equal(_scores(policy), expected)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert torch.equal(_scores(GaussianActor(policy)), expected)
-    fresh = settle_model(_config(tmp_path, model=ModelConfig(name="modgnn_mlp", hops=2, hidden=8)))
+    fresh = resolve_model(_config(tmp_path, model=ModelConfig(name="modgnn_mlp", hops=2, hidden=8)))
     assert not torch.equal(_scores(initial_policy(fresh)), expected)
 
 
 def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_with(cloned, tmp_path):
-    run = train(_config(tmp_path, init_from=str(cloned.path), iterations=2, critic_warmup=2))
+    run = train(_config(tmp_path, init_from=str(cloned.path), rounds=2, critic_warmup=2))
     assert run.config["model"]["name"] == "modgnn_mlp"
     assert torch.equal(_scores(load_policy(run.path)), _scores(load_policy(cloned.path)))
 
@@ -110,13 +112,13 @@ def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
 
 
 def test_each_size_has_metrics_of_its_own(cloned, tmp_path):
-    env, pull = FlockingConfig(num_agents=[3, 5], max_steps=15), {"anchor": 0.2, "anchor_rounds": 4}
+    env, pull = FlockingConfig(num_agents=[3, 5], max_steps=15), {"kl_coef": 0.2, "kl_rounds": 4}
     metrics = train(_config(tmp_path, env=env, init_from=str(cloned.path), **pull)).read_metrics()
     assert [line["step"] for line in metrics] == [1, 2, 3]
     common = ("reward", "cost/leader", "cost/effort", "error", "cohesion", "loss_critic", "kl_approx", "entropy")
     assert all({f"{size}/{name}" for size in (3, 5) for name in common} <= set(line) for line in metrics)
     assert [("3/loss_anchor" in line) for line in metrics] == [False, True, True]
-    assert [line["anchor"] for line in metrics] == pytest.approx([0.2, 0.2, 0.15])
+    assert [line["kl_coef"] for line in metrics] == pytest.approx([0.2, 0.2, 0.15])
     assert metrics[0]["noise"] == pytest.approx(0.3)
 
 
@@ -164,8 +166,8 @@ def test_a_beginning_that_cannot_be_is_refused_before_anything_is_created(
 @pytest.mark.parametrize(
     ("trainer", "message"),
     [
-        (MAPPOConfig(round_steps=11, window=10), "round_steps=11 is too short .* at least 12"),
-        (DAggerConfig(round_steps=2), "round_steps=2 is too short .* at least 3"),
+        (MAPPOConfig(steps_per_round=11, window=10), "steps_per_round=11 is too short .* at least 12"),
+        (DAggerConfig(steps_per_round=2), "steps_per_round=2 is too short .* at least 3"),
         (BCConfig(cloning_steps=2), "cloning_steps=2 is too short .* at least 3"),
         (BCConfig(cloning_steps=11, dart=True), "cloning_steps=11 is too short .* at least 12"),
     ],
@@ -187,8 +189,8 @@ def test_the_anchor_fades_linearly_after_the_warm_up():
 
 
 def test_a_fresh_policy_is_not_held_back(tmp_path):
-    metrics = train(_config(tmp_path, anchor=100.0)).read_metrics()
-    assert [line["anchor"] for line in metrics] == [0.0] * 3
+    metrics = train(_config(tmp_path, kl_coef=100.0)).read_metrics()
+    assert [line["kl_coef"] for line in metrics] == [0.0] * 3
     assert not any("4/loss_anchor" in line for line in metrics)
 
 
@@ -203,7 +205,7 @@ def test_callbacks_can_stop_it(tmp_path):
 @pytest.mark.slow
 def test_the_command_trains_on(cloned, tmp_path):
     """As a user runs it: from the run folder of a cloned policy, with the trainer's own YAML."""
-    small = ["num_envs=1", "iterations=1", "round_steps=4", "epochs=1", "batches=1", "critic_hidden=8"]
+    small = ["num_envs=1", "rounds=1", "steps_per_round=4", "epochs=1", "num_minibatches=1", "critic_hidden=8"]
     command = [sys.executable, "-m", "modgnn_rl.train", "trainer=mappo", f"init_from={cloned.path}"]
     command += [f"trainer.{setting}" for setting in small]
     command += ["env.num_agents=3", "evaluation.num_flocks=2", "evaluation.steps=4"]
@@ -220,8 +222,8 @@ def test_from_scratch_the_reward_rises(tmp_path):
     """Where only effort costs, the best action is the velocity that one has."""
     others = {f"{name}_cost": 0.0 for name in ("leader", "cohesion", "crowding", "collision", "alignment")}
     env = FlockingConfig(num_agents=3, max_steps=100, effort_cost=1.0, **others)
-    rates = {"learning_rate": 1e-2, "critic_learning_rate": 1e-2, "discount": 0.9}
-    settings = {"iterations": 8, "round_steps": 16, "epochs": 4, "batches": 4}
+    rates = {"learning_rate": 1e-2, "critic_learning_rate": 1e-2, "gamma": 0.9}
+    settings = {"rounds": 8, "steps_per_round": 16, "epochs": 4, "num_minibatches": 4}
     run = train(_config(tmp_path, env=env, model=ModelConfig(name="gcn"), **rates, **settings))
     rewards = [line["3/reward"] for line in run.read_metrics()]
     assert sum(rewards[-3:]) > 0.8 * sum(rewards[:3])

@@ -14,9 +14,9 @@ from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers import bc as trainer_module
-from modgnn_rl.trainers.collectors.behaviour import Disturbance
-from modgnn_rl.trainers.collectors.flocks import Flocks
-from modgnn_rl.trainers.imitation.learner import Learner, fit_together, validate_together
+from modgnn_rl.trainers.collectors.behaviour import ActionNoise
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer
+from modgnn_rl.trainers.imitation.learner import ImitationLearner, fit_together, validate_together
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.trainers.loop.setup import side_by_side
 
@@ -34,8 +34,8 @@ def _config(runs, *, model=None, seed=0, **settings):
         "batch_size": 8,
         "cloning_steps": 12,
         "cloning_updates": 20,
-        "held_out": 2,
-        "averaging": 0.8,
+        "num_val_envs": 2,
+        "ema_decay": 0.8,
     }
     return TrainConfig(
         env=WORLD,
@@ -60,7 +60,7 @@ def test_a_run_of_several_policies(tmp_path, monkeypatch):
     """Folders, names, metrics."""
     evaluated = []
     monkeypatch.setattr(training, "evaluate_policies", lambda _, policies, *__, **___: evaluated.append(policies) or {})
-    run = train(_config(tmp_path, **SEVERAL, cloning_steps=8, held_out=1))
+    run = train(_config(tmp_path, **SEVERAL, cloning_steps=8, num_val_envs=1))
     assert sorted(path.name for path in run.path.iterdir() if (path / "config.yaml").exists()) == sorted(NAMES)
     assert [list(policies) for policies in evaluated] == [NAMES]
     for line in run.read_metrics():
@@ -128,7 +128,7 @@ def test_members_are_trained_by_what_they_are_told_to(tmp_path):
     train(_config(tmp_path, models=["gcn"], hops=[1, 2], cloning_updates=1), callbacks=[start])
     for hops in (1, 2):
         fresh = side_by_side(_config(tmp_path, models=["gcn"], hops=[1, 2]))[f"gcn-K{hops}"]
-        expected = trainer_module.make_learner(fresh, (1, 1)).flown.state_dict()
+        expected = trainer_module.make_learner(fresh, (1, 1)).ema_policy.state_dict()
         assert all(torch.equal(value, expected[key]) for key, value in start.policies[f"gcn-K{hops}"].items())
 
 
@@ -151,14 +151,14 @@ def test_what_cannot_be_trained_is_refused_before_anything_is_created(tmp_path, 
 
 @pytest.mark.usefixtures("_without_evaluation")
 def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path, monkeypatch):
-    flown, forward = [], Disturbance.forward
+    flown, forward = [], ActionNoise.forward
 
     def watched(self, tensordict):
         if not flown or flown[-1] != self.scale:
             flown.append(self.scale)
         return forward(self, tensordict)
 
-    monkeypatch.setattr(Disturbance, "forward", watched)
+    monkeypatch.setattr(ActionNoise, "forward", watched)
     metrics = train(_config(tmp_path, dart=True, noise=0.1, cloning_updates=40)).read_metrics()
     # Tried out, and flown for validation, without noise; each part with the error of the round before it.
     after = [metrics[index]["4/validation_loss"] ** 0.5 for index in (9, 19, 29)]
@@ -172,14 +172,14 @@ def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path
 @pytest.mark.parametrize("rounds", [2, 6])
 @pytest.mark.parametrize(("settings", "sets"), [({}, 1), ({"dart": True}, 4)])
 def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settings, sets, rounds):
-    seen, keep = [], Flocks.keep
+    seen, keep = [], FlockBuffer.keep
 
-    def watched(self, flights):
-        keep(self, flights)
-        seen.append((*flights.shape, self.seen))
+    def watched(self, rollouts):
+        keep(self, rollouts)
+        seen.append((*rollouts.shape, self.seen))
 
-    monkeypatch.setattr(Flocks, "keep", watched)
-    train(_config(tmp_path, cloning_updates=rounds, every=1, noise=0.2, **settings))
+    monkeypatch.setattr(FlockBuffer, "keep", watched)
+    train(_config(tmp_path, cloning_updates=rounds, stride=1, noise=0.2, **settings))
     of_training = [entry for entry in seen if entry[0] == 8]
     assert len(of_training) == sets
     assert sum(steps for _, steps, _ in of_training) == 12
@@ -187,8 +187,8 @@ def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settin
 
 
 def _flights(policies, **settings):
-    trainer = BCConfig(**{"num_envs": 1, "batch_size": 8, "averaging": 0.8, **settings})
-    flocks = Flocks(WORLD, trainer, 6, 4, policies, Reynolds(), steps=12, stretch=12, seed=0)
+    trainer = BCConfig(**{"num_envs": 1, "batch_size": 8, "ema_decay": 0.8, **settings})
+    flocks = FlockBuffer(WORLD, trainer, 6, 4, policies, Reynolds(), steps=12, hold_steps=12, seed=0)
     flocks.keep(flocks.fly(1.0))
     return trainer, flocks.buffer
 
@@ -206,15 +206,15 @@ def test_fitting_together_is_fitting_each_alone_on_the_same_batches(models):
         return [make_model(name, hidden=8, seed=seed, **model) for seed, (name, model) in enumerate(models)]
 
     trainer, buffer = _flights(policies(), hide_velocity=0.0)
-    together = [Learner(policy, trainer, (12, 12), seed=0) for policy in policies()]
+    together = [ImitationLearner(policy, trainer, (12, 12), seed=0) for policy in policies()]
     losses = fit_together(together, buffer, 12)
     final = validate_together(together, buffer)
     for number, policy in enumerate(policies()):
         _, buffer = _flights(policies())  # the same data, and the same draws of batches
-        alone = Learner(policy, trainer, (12, 12), seed=0)
+        alone = ImitationLearner(policy, trainer, (12, 12), seed=0)
         assert fit_together([alone], buffer, 12)[0] == pytest.approx(losses[number], rel=1e-4)
         assert alone.validate(buffer) == pytest.approx(final[number], rel=1e-3)
-        for kind in ("policy", "flown"):
+        for kind in ("policy", "ema_policy"):
             for name, value in getattr(alone, kind).state_dict().items():
                 torch.testing.assert_close(
                     getattr(together[number], kind).state_dict()[name], value, rtol=1e-3, atol=1e-5

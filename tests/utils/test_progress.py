@@ -44,7 +44,7 @@ def test_plain_lines_come_seldom_and_say_everything():
 
 def test_a_short_run_has_its_last_line_only():
     stream = io.StringIO()
-    with Progress("evaluate", 10, unit="flights", stream=stream, clock=Clock()) as progress:
+    with Progress("evaluate", 10, unit="rollouts", stream=stream, clock=Clock()) as progress:
         progress.update(4, row="expert")
         progress.update(6, error=1e-5)
     (line,) = stream.getvalue().splitlines()

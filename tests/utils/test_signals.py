@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from modgnn_rl.utils.signals import Interruption, Stopped
+from modgnn_rl.utils.signals import GracefulInterrupt, Stopped
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
@@ -20,7 +20,7 @@ def test_a_signal_waits_for_the_check(number, capfd):
     done = []
 
     def work():
-        with Interruption().listen() as interruption, interruption.deferred("Stopping soon."):
+        with GracefulInterrupt().listen() as interruption, interruption.deferred("Stopping soon."):
             os.kill(os.getpid(), number)
             done.append("the step")
             assert interruption.is_asked_for
@@ -39,7 +39,7 @@ def test_elsewhere_it_stops_at_once(number):
     done = []
 
     def work():
-        with Interruption().listen():
+        with GracefulInterrupt().listen():
             os.kill(os.getpid(), number)
             done.append("too much")
 
@@ -50,7 +50,7 @@ def test_elsewhere_it_stops_at_once(number):
 
 def test_the_handlers_of_before_are_given_back():
     before = [signal.getsignal(number) for number in CODES]
-    with Interruption().listen() as interruption:
+    with GracefulInterrupt().listen() as interruption:
         assert signal.getsignal(signal.SIGTERM) != before[1]
         assert not interruption.is_asked_for
         interruption.check()
@@ -61,7 +61,7 @@ def test_another_thread_listens_to_nothing():
     before, heard = signal.getsignal(signal.SIGTERM), []
 
     def work():
-        with Interruption().listen():
+        with GracefulInterrupt().listen():
             heard.append(signal.getsignal(signal.SIGTERM))
 
     thread = threading.Thread(target=work)
@@ -74,8 +74,8 @@ def test_another_thread_listens_to_nothing():
 def test_the_second_ends_the_process_whatever_it_does(number):
     program = f"""
 import os, time
-from modgnn_rl.utils.signals import Interruption
-with Interruption().listen() as interruption:
+from modgnn_rl.utils.signals import GracefulInterrupt
+with GracefulInterrupt().listen() as interruption:
     with interruption.deferred("Stopping soon."):
         try:
             for _ in range(2):

@@ -1,4 +1,4 @@
-"""Replays: what is kept of a flight, and that the page gives it back in a real browser."""
+"""Replays: what is kept of a rollout, and that the page gives it back in a real browser."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig
 from modgnn_rl.envs.flocking.recording import METRICS, QUANTUM, Recorder, Recording, spacing
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation.rollout import fly, reference_policies
+from modgnn_rl.evaluation.rollout import reference_policies, rollout
 from modgnn_rl.nn.topology import as_matrix
 from modgnn_rl.replay import refuse
 from modgnn_rl.visualization import html
@@ -30,17 +30,17 @@ needs_chromium = pytest.mark.skipif(
 FAULTY = FlockingConfig(num_agents=7, message_loss=0.3, delay=1, range_spread=0.3, dropout_rate=2.0)
 
 
-def _record(world, agents=7, steps=30, every=1, name="expert"):
+def _record(env_config, agents=7, steps=30, stride=1, name="expert"):
     """A recording, and for each step the links of the radio and the positions."""
-    recorder, seen = Recorder(world, every), []
+    recorder, seen = Recorder(env_config, stride), []
 
     def watch(flocks):
         recorder(flocks)
         links = as_matrix(flocks["adjacency"], agents)[0].flatten().nonzero().squeeze(-1)
-        seen.append((links.numpy(), flocks[world.state_key][0, :, :3].double().numpy()))
+        seen.append((links.numpy(), flocks[env_config.state_key][0, :, :3].double().numpy()))
 
-    policy = reference_policies(world)[name]
-    fly(policy, world, num_agents=agents, num_flocks=2, steps=steps, seed=5, watch=watch)
+    policy = reference_policies(env_config)[name]
+    rollout(policy, env_config, num_agents=agents, num_flocks=2, steps=steps, seed=5, watch=watch)
     return recorder.recording(), seen
 
 
@@ -55,7 +55,7 @@ def test_links_are_those_of_the_radio_under_faults(graph):
 
 
 def test_some_of_the_steps_are_kept():
-    (all_steps, _), (some, _) = (_record(FAULTY, every=every) for every in (1, 4))
+    (all_steps, _), (some, _) = (_record(FAULTY, stride=stride) for stride in (1, 4))
     assert np.array_equal(some.position, all_steps.position[::4])
     assert np.array_equal(some.metrics["error"], all_steps.metrics["error"][::4])
     assert (spacing(32, 1000), spacing(1000, 1000), spacing(32, 1000, 250), spacing(2, 10, 250)) == (1, 5, 4, 1)
@@ -107,7 +107,7 @@ def test_packing_loses_nothing(agents):
         present=random.random((steps, agents)) < 0.5,
         flips=[np.sort(random.choice(links, int(random.integers(0, links)), replace=False)) for _ in range(steps)],
         metrics={name: random.random(steps) for name in METRICS},
-        every=1,
+        stride=1,
         comm_range=3.5,
         max_speed=0.92,
         frequency=48.0,
@@ -120,8 +120,8 @@ def test_packing_loses_nothing(agents):
     assert all(np.array_equal(one, other) for one, other in zip(flips, recording.flips, strict=True))
 
 
-def _page(tmp_path, world=FAULTY, names=("expert", "zero action"), title="a </script> title", **flight):
-    recordings = {name: _record(world, name=name, **flight)[0] for name in names}
+def _page(tmp_path, env_config=FAULTY, names=("expert", "zero action"), title="a </script> title", **rollout):
+    recordings = {name: _record(env_config, name=name, **rollout)[0] for name in names}
     path = tmp_path / "replay.html"
     html.write_replay(path, recordings, title, {"seed": 5})
     return path
@@ -137,10 +137,10 @@ def test_the_page_asks_for_nothing_and_shows_names_as_they_are(tmp_path):
 
 @pytest.mark.slow
 def test_two_flights_of_32_agents_and_1000_steps_take_less_than_a_megabyte(tmp_path):
-    world, names = FlockingConfig(), ("expert", "LocalReynolds(hops=1)")
-    policies = reference_policies(world)
-    flights = {name: record(policies[name], world, num_agents=32, steps=1000, seed=5) for name in names}
-    html.write_replay(tmp_path / "replay.html", flights, "two flights")
+    env_config, names = FlockingConfig(), ("expert", "LocalReynolds(hops=1)")
+    policies = reference_policies(env_config)
+    rollouts = {name: record(policies[name], env_config, num_agents=32, steps=1000, seed=5) for name in names}
+    html.write_replay(tmp_path / "replay.html", rollouts, "two rollouts")
     assert (tmp_path / "replay.html").stat().st_size < 1_000_000
 
 
@@ -229,8 +229,8 @@ def test_the_page_plays_and_holds_what_was_recorded(page, dark):
         for step in (0, 17, 59):
             window.run(f"goTo({step} * PERIOD)")
             assert window.run("frameNow()") == step
-            assert window.run(f"findLinks(flights[0], {step}).directed") == len(seen[step][0])
-            at = window.run(f"Array.from({{length: N}}, (_, n) => flights[0].position[n * T + {step}])")
+            assert window.run(f"findLinks(rollouts[0], {step}).directed") == len(seen[step][0])
+            at = window.run(f"Array.from({{length: N}}, (_, n) => rollouts[0].position[n * T + {step}])")
             assert at == recording.position[step, :, 0].tolist()
         _quiet(window)
 
@@ -294,8 +294,8 @@ def test_a_phone_shows_all_of_it_and_every_control_acts_by_touch(page):
 @pytest.mark.slow
 @needs_chromium
 def test_a_thousand_agents_are_drawn(tmp_path):
-    world = FlockingConfig(num_agents=1000, start_radius=12.0, graph="links", comm_range=2.0)
-    page = _page(tmp_path, world, ("expert",), agents=1000, steps=4)
+    env_config = FlockingConfig(num_agents=1000, start_radius=12.0, graph="links", comm_range=2.0)
+    page = _page(tmp_path, env_config, ("expert",), agents=1000, steps=4)
     with browser.Browser() as window:
         _open(window, page)
         window.run("goTo(PERIOD)")

@@ -15,23 +15,23 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.visualization.video import Frame, as_gif, film, write_video
 
 
-def _frames(world, steps=12, agents=5):
-    expert = Reynolds.for_env(world, action=("agents", "action"))
-    return film(expert, world, num_agents=agents, steps=steps, seed=3)
+def _frames(env_config, steps=12, agents=5):
+    expert = Reynolds.for_env(env_config, action=("agents", "action"))
+    return film(expert, env_config, num_agents=agents, steps=steps, seed=3)
 
 
 def test_a_film_follows_the_flight():
-    world = FlockingConfig(num_agents=5)
-    frames = _frames(world)
+    env_config = FlockingConfig(num_agents=5)
+    frames = _frames(env_config)
     assert len(frames) == 6
     for frame in frames:
         distance = np.linalg.norm(frame.position[:, None] - frame.position, axis=-1)
-        heard = np.argwhere(np.triu(distance <= world.comm_range, 1))
+        heard = np.argwhere(np.triu(distance <= env_config.comm_range, 1))
         assert (frame.links == heard).all()
     # Two steps move an agent by what its velocity, below 1 m/s and at first that of the last target, allows.
     moved = np.linalg.norm(frames[-1].position - frames[0].position, axis=-1)
-    assert ((moved > 0) & (moved < 10 / world.control_frequency)).all()
-    assert all((one.position == other.position).all() for one, other in zip(frames, _frames(world), strict=True))
+    assert ((moved > 0) & (moved < 10 / env_config.control_frequency)).all()
+    assert all((one.position == other.position).all() for one, other in zip(frames, _frames(env_config), strict=True))
 
 
 def test_a_list_of_links_gives_the_same_film():
@@ -51,8 +51,8 @@ def test_a_video_shows_every_frame_and_the_leader_in_red(tmp_path):
     position = np.zeros((4, 3))
     position[0, 0], position[3] = 2.0, np.nan  # one that does not exist
     frames = [Frame(position, np.zeros((4, 3)), np.array([[0, 1]]))] * 7
-    write_video(tmp_path / "flight.mp4", frames, 48.0)
-    with av.open(str(tmp_path / "flight.mp4")) as file:
+    write_video(tmp_path / "rollout.mp4", frames, 48.0)
+    with av.open(str(tmp_path / "rollout.mp4")) as file:
         assert file.streams.video[0].average_rate == 24
         pictures = [picture.to_ndarray(format="rgb24").astype(int) for picture in file.decode(video=0)]
     assert len(pictures) == 7
@@ -62,7 +62,7 @@ def test_a_video_shows_every_frame_and_the_leader_in_red(tmp_path):
         row, column = (places.mean() / size for places, size in zip(np.nonzero(view), view.shape, strict=True))
         assert column > 0.6
         assert 0.4 < row < 0.6
-    gif, width, height = as_gif(tmp_path / "flight.mp4")
+    gif, width, height = as_gif(tmp_path / "rollout.mp4")
     with av.open(io.BytesIO(gif)) as file:
         stream = file.streams.video[0]
         assert (stream.width, stream.height) == (width, height)
@@ -75,11 +75,11 @@ def test_a_video_is_whole_or_not_there(tmp_path):
     frame = Frame(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((0, 2), int))
     broken = Frame(np.ones((3, 3)), np.zeros((2, 3)), np.zeros((0, 2), int))
     with pytest.raises(ValueError, match="shape"):
-        write_video(tmp_path / "flight.mp4", [frame, broken], 48.0)
+        write_video(tmp_path / "rollout.mp4", [frame, broken], 48.0)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_missing_packages_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="pip install av matplotlib"):
-        write_video(tmp_path / "flight.mp4", [], 48.0)
+        write_video(tmp_path / "rollout.mp4", [], 48.0)

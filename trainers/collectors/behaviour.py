@@ -1,7 +1,7 @@
 """Who flies while data are collected: policy, expert, or whichever is safe; modules to put behind both in a sequence.
 
-A sequence ``policy, expert, Mixture, SafetyGate, Disturbance`` lets the policy's messages advance in any case, labels
-every state, and then chooses which action is flown.
+A sequence ``policy, expert, BetaMixture, SafetyGate, ActionNoise`` lets the policy's messages advance in any case,
+labels every state, and then chooses which action is flown.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from torch import Tensor
 
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.nn.primer import AgentCache
+from modgnn_rl.nn.primer import RecurrentStatePrimer
 
-__all__ = ["Disturbance", "Ensemble", "Mixture", "SafetyGate", "disagreement", "expert_share", "spread"]
+__all__ = ["ActionNoise", "BetaMixture", "Ensemble", "SafetyGate", "beta_schedule", "disagreement", "ensemble_std"]
 
 
-def expert_share(schedule: str, round_index: int, *, start: float, decay: float, last_round: int) -> float:
+def beta_schedule(schedule: str, round_index: int, *, start: float, decay: float, last_round: int) -> float:
     """The expert's share of the flying time in one round; with each schedule 0 from ``last_round`` on.
 
     Args:
@@ -49,7 +49,7 @@ def expert_share(schedule: str, round_index: int, *, start: float, decay: float,
     raise InputError(f"schedule '{schedule}' is not one of constant, linear, exponential")
 
 
-class Mixture(TensorDictModuleBase):
+class BetaMixture(TensorDictModuleBase):
     """DAgger's behaviour policy: overwrites the policy's action by the expert's, flock by flock, for stretches of time.
 
     It stands behind the policy and the expert in a sequence, so that the policy's messages advance in any case. At
@@ -57,7 +57,7 @@ class Mixture(TensorDictModuleBase):
 
     Args:
         share: probability that the expert flies a flock; may be set anew at any time, for the tosses that follow.
-        stretch: steps between two tosses.
+        hold_steps: steps between two tosses.
         generator: source of randomness.
         action: key of the policy's action, overwritten [*B, N, 3].
         expert_action: key of the expert's action [*B, N, 3].
@@ -66,8 +66,8 @@ class Mixture(TensorDictModuleBase):
 
     def __init__(
         self,
-        share: float,
-        stretch: int,
+        beta: float,
+        hold_steps: int,
         generator: torch.Generator,
         *,
         action: NestedKey = ("agents", "action"),
@@ -75,8 +75,8 @@ class Mixture(TensorDictModuleBase):
         expert_flies: NestedKey = "expert_flies",
     ) -> None:
         super().__init__()
-        self.share = share
-        self.stretch = stretch
+        self.beta = beta
+        self.hold_steps = hold_steps
         self.generator = generator
         self.in_keys: list[Any] = [action, expert_action]
         self.out_keys: list[Any] = [action, expert_flies]
@@ -102,11 +102,11 @@ class Mixture(TensorDictModuleBase):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a copy in another process must hear of, as a part of the module's state."""
-        return {"share": self.share, "restarts": self._restarts}
+        return {"share": self.beta, "restarts": self._restarts}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over share and restarts."""
-        self.share = state["share"]
+        self.beta = state["share"]
         if state["restarts"] != self._restarts:
             self.restart()
             self._restarts = state["restarts"]
@@ -115,9 +115,9 @@ class Mixture(TensorDictModuleBase):
         """Choose the action of each flock."""
         action, expert_action = (tensordict[key] for key in self.in_keys)
         flocks = tensordict.batch_size
-        if self._expert_flies is None or self._steps % self.stretch == 0:
+        if self._expert_flies is None or self._steps % self.hold_steps == 0:
             coin = torch.rand(flocks, generator=self.generator, device=self.generator.device)
-            self._expert_flies, self._steps = (coin < self.share).unsqueeze(-1).to(action.device), 0
+            self._expert_flies, self._steps = (coin < self.beta).unsqueeze(-1).to(action.device), 0
         self._steps += 1
         chosen = torch.where(self._expert_flies.unsqueeze(-1), expert_action, action)
         return tensordict.set(self.out_keys[0], chosen).set(self.out_keys[1], self._expert_flies.clone())
@@ -130,10 +130,10 @@ def disagreement(tensordict: TensorDictBase) -> Tensor:
     return _root_mean(difference, agents["controlled"])
 
 
-def spread(tensordict: TensorDictBase) -> Tensor:
+def ensemble_std(tensordict: TensorDictBase) -> Tensor:
     """How far the members of an `Ensemble` are apart: root mean square over the flown agents, m/s [*B]."""
     agents = tensordict["agents"]
-    return _root_mean(agents["spread"].square(), agents["controlled"])
+    return _root_mean(agents["ensemble_std"].square(), agents["controlled"])
 
 
 def _root_mean(values: Tensor, counted: Tensor) -> Tensor:
@@ -145,14 +145,14 @@ class SafetyGate(TensorDictModuleBase):
     """Let the expert fly a flock as long as the policy strays there.
 
     With `disagreement` as measure this is the rule that SafeDAgger (Zhang and Cho 2017) learns to predict, here taken
-    from the expert itself; with `spread`, which asks no expert, EnsembleDAgger (Menda et al. 2019).
+    from the expert itself; with `ensemble_std`, which asks no expert, EnsembleDAgger (Menda et al. 2019).
 
     Args:
         measure: from the data of a step to how much each flock strays [*B].
         threshold: the expert flies above it.
         action: key of the action to be flown, overwritten [*B, N, 3].
         expert_action: key of the expert's action [*B, N, 3].
-        expert_flies: key that tells who flew, bool [*B, 1]; where a `Mixture` stands before the gate, both count.
+        expert_flies: key that tells who flew, bool [*B, 1]; where a `BetaMixture` stands before the gate, both count.
     """
 
     def __init__(
@@ -178,7 +178,7 @@ class SafetyGate(TensorDictModuleBase):
         return tensordict.set(self.out_keys[1], strays if flies is None else flies | strays)
 
 
-class Disturbance(TensorDictModuleBase):
+class ActionNoise(TensorDictModuleBase):
     """Noise in what is flown, so that the expert shows how it recovers (DART, Laskey et al. 2017).
 
     ``a + N(0, scale^2)`` in each component, at every step anew; labels are left as they are.
@@ -224,14 +224,14 @@ class Ensemble(TensorDictModuleBase):
         spread: key of the root mean square distance of the members' actions from their mean, m/s [*B, N].
     """
 
-    def __init__(self, members: Sequence[ModGNN], *, spread: NestedKey = ("agents", "spread")) -> None:
+    def __init__(self, members: Sequence[ModGNN], *, ensemble_std: NestedKey = ("agents", "ensemble_std")) -> None:
         super().__init__()
         self.first = members[0]
         # Not registered: the first member's messages are the ones that an environment's primer is made for.
         self._others = tuple(members[1:])
         self._messages = [f"{self.first.messages_key}_{number}" for number in range(1, len(members))]
         self.in_keys: list[Any] = [*self.first.in_keys, *self._messages]
-        self.out_keys: list[Any] = [*self.first.out_keys, *(("next", key) for key in self._messages), spread]
+        self.out_keys: list[Any] = [*self.first.out_keys, *(("next", key) for key in self._messages), ensemble_std]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the first member's action and messages, the others' messages, and the spread."""
@@ -261,6 +261,6 @@ class Ensemble(TensorDictModuleBase):
         for member, weights in zip(self._others, state, strict=True):
             member.load_state_dict(weights)
 
-    def make_tensordict_primer(self) -> AgentCache:
+    def make_tensordict_primer(self) -> RecurrentStatePrimer:
         """The transform that gives an environment the other members' messages; the first brings its own."""
-        return AgentCache(self, self._messages, is_init=self.first.in_keys[2])
+        return RecurrentStatePrimer(self, self._messages, is_init=self.first.in_keys[2])

@@ -1,4 +1,4 @@
-"""Flights for training: flocks that never stop flying, the expert's label at every state that they visit."""
+"""Rollouts for training: flocks that never stop flying, the expert's label at every state that they visit."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRo
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, CollectorConfig, FlockingConfig, ImitationConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.collectors.behaviour import Disturbance, Ensemble, Mixture, SafetyGate, spread
-from modgnn_rl.trainers.collectors.local import make_flights
+from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, Ensemble, SafetyGate, ensemble_std
+from modgnn_rl.trainers.collectors.local import make_collector
 from modgnn_rl.trainers.collectors.windows import as_windows, reservoir_places, window_of
 from modgnn_rl.trainers.common.state import Part, Tensors
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = [
-    "Flocks",
+    "FlockBuffer",
     "flocks_of",
-    "flocks_of_all_sizes",
-    "named_flocks",
-    "validation_flocks",
+    "make_buffers",
+    "make_validation_buffers",
+    "named_buffers",
 ]
 
 
-class Flocks:
+class FlockBuffer:
     """Flocks of one size, flown by a mixture of policy and expert, and their data.
 
-    `keep` adds windows of flights to the replay buffer.
+    `keep` adds windows of rollouts to the replay buffer.
 
     Args:
         config: the world.
-        settings: how flights become data.
+        settings: how rollouts become data.
         num_envs: flocks flown at once, B.
         num_agents: agents in each, N.
         policies: those that learn from the data; the first flies beside the expert (weights changed in place are flown
             at once), all of them if there is a gate that looks at their spread.
         expert: writes ``("agents", "expert_action")``.
         steps: steps of one call of `fly`.
-        stretch: steps that the one who flies a flock keeps it.
+        hold_steps: steps that the one who flies a flock keeps it.
         gate: lets the expert fly where the policy strays.
         seed: seeds the environment, the mixture and the sampling of batches.
         device: where flocks and data live.
         collector: which processes fly; default: this one.
 
     Attributes:
-        flights: the flights that never end.
+        rollouts: the rollouts that never end.
         window: steps of a window of the data.
         mixture, disturbance: who flies, and how it is disturbed.
         buffer: the data.
@@ -66,7 +66,7 @@ class Flocks:
         expert: TensorDictModuleBase,
         *,
         steps: int,
-        stretch: int,
+        hold_steps: int,
         gate: SafetyGate | None = None,
         seed: int,
         device: torch.device | str = "cpu",
@@ -79,12 +79,12 @@ class Flocks:
         self.keys |= {*expert.out_keys[:1]}
         if self.window > 1:
             self.keys -= {policy.messages_key for policy in policies}
-        self.mixture = Mixture(1.0, stretch, torch.Generator().manual_seed(derive_seed(seed, "mixture")))
-        self.disturbance = Disturbance(0.0, torch.Generator().manual_seed(derive_seed(seed, "disturbance")))
-        flown = Ensemble(policies) if gate is not None and gate.measure is spread else policies[0]
+        self.mixture = BetaMixture(1.0, hold_steps, torch.Generator().manual_seed(derive_seed(seed, "mixture")))
+        self.action_noise = ActionNoise(0.0, torch.Generator().manual_seed(derive_seed(seed, "disturbance")))
+        flown = Ensemble(policies) if gate is not None and gate.measure is ensemble_std else policies[0]
         gates = [] if gate is None else [gate]
-        behaviour = (flown, expert, self.mixture, *gates, self.disturbance)
-        self.flights = make_flights(
+        behaviour = (flown, expert, self.mixture, *gates, self.action_noise)
+        self.rollouts = make_collector(
             collector, config, num_envs, num_agents, behaviour, steps=steps, seed=seed, device=device
         )
         self.mixture.restart()  # the collector has tried the policy out
@@ -99,14 +99,14 @@ class Flocks:
             generator=torch.Generator(device).manual_seed(derive_seed(seed, "batches")),
         )
 
-    def fly(self, expert_share: float) -> TensorDictBase:
-        """Continue the flights by some steps, and label every state with the expert's action; flights [B, T]."""
-        self.mixture.share = expert_share
-        return self.flights.continue_flights()
+    def fly(self, beta: float) -> TensorDictBase:
+        """Continue the rollouts by some steps, and label every state with the expert's action; rollouts [B, T]."""
+        self.mixture.beta = beta
+        return self.rollouts.collect()
 
-    def keep(self, flights: TensorDictBase) -> None:
-        """Add windows of flights to the data; where these are full, what ``settings.replacement`` says goes."""
-        windows = as_windows(flights.select(*self.keys, strict=False), self.window, self.settings.every)
+    def keep(self, rollouts: TensorDictBase) -> None:
+        """Add windows of rollouts to the data; where these are full, what ``settings.replacement`` says goes."""
+        windows = as_windows(rollouts.select(*self.keys, strict=False), self.window, self.settings.stride)
         room = max(0, self.settings.capacity - self.seen) if self.settings.replacement == "reservoir" else len(windows)
         if room:
             self.buffer.extend(windows[:room])
@@ -119,10 +119,10 @@ class Flocks:
     def generators(self) -> dict[str, torch.Generator]:
         """All that draws at random here, by name."""
         return {
-            **self.flights.generators,
+            **self.rollouts.generators,
             "places": self.noise,
             "mixture": self.mixture.generator,
-            "disturbance": self.disturbance.generator,
+            "disturbance": self.action_noise.generator,
             "batches": self.buffer._rng,
         }
 
@@ -131,10 +131,10 @@ class Flocks:
         self.buffer, self._owns_data = buffer, False
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
-        """What a checkpoint holds of flights and data."""
-        tensors, values = self.flights.state()
+        """What a checkpoint holds of rollouts and data."""
+        tensors, values = self.rollouts.state()
         tensors["mixture"] = self.mixture.state()
-        values |= {"disturbance": self.disturbance.scale, "seen": self.seen}
+        values |= {"disturbance": self.action_noise.scale, "seen": self.seen}
         if self._owns_data and self.settings.checkpoint_data and len(self.buffer):
             tensors["data"] = dict(self.buffer[:].flatten_keys("/").items())
             values["writer"] = self.buffer.writer.state_dict()
@@ -144,11 +144,11 @@ class Flocks:
         """Go on from what `state` gave; without data where the checkpoint has none.
 
         Raises:
-            KeyError, RuntimeError: these are flights or data of others.
+            KeyError, RuntimeError: these are rollouts or data of others.
         """
-        self.flights.restore(tensors, values)
+        self.rollouts.restore(tensors, values)
         self.mixture.restore(tensors["mixture"])
-        self.disturbance.scale = float(values["disturbance"])
+        self.action_noise.scale = float(values["disturbance"])
         if "data" in tensors:
             rows = len(next(iter(tensors["data"].values())))
             self.buffer.extend(TensorDict(tensors["data"], [rows, self.window]).unflatten_keys("/"))
@@ -156,22 +156,22 @@ class Flocks:
             self.seen = int(values["seen"])
 
     def close(self) -> None:
-        """End the flights."""
-        self.flights.close()
+        """End the rollouts."""
+        self.rollouts.close()
 
 
-def flocks_of_all_sizes(
+def make_buffers(
     config: TrainConfig,
     policies: Sequence[ModGNN],
     expert: TensorDictModuleBase,
     *,
     steps: int,
-    stretch: int,
+    hold_steps: int,
     gate: SafetyGate | None = None,
-) -> dict[int, Flocks]:
+) -> dict[int, FlockBuffer]:
     """The flocks of a training run, by their size: all in ``config.env.num_agents``, of as many agents each."""
     return {
-        size: Flocks(
+        size: FlockBuffer(
             config.env,
             config.trainer,
             flocks_of(size, config),
@@ -179,7 +179,7 @@ def flocks_of_all_sizes(
             policies,
             expert,
             steps=steps,
-            stretch=stretch,
+            hold_steps=hold_steps,
             gate=gate,
             seed=derive_seed(config.seed, "flocks", size),
             device=config.device,
@@ -189,23 +189,23 @@ def flocks_of_all_sizes(
     }
 
 
-def validation_flocks(
+def make_validation_buffers(
     config: TrainConfig,
     policies: Sequence[ModGNN],
     expert: TensorDictModuleBase,
     *,
     steps: int,
-    stretch: int,
-) -> dict[int, Flocks]:
-    """The ``trainer.held_out`` flocks of each size whose flights are not trained on, flown in this process."""
-    held_out = dataclasses.replace(config.trainer, num_envs=config.trainer.held_out)
+    hold_steps: int,
+) -> dict[int, FlockBuffer]:
+    """The ``trainer.num_val_envs`` flocks of each size whose rollouts are not trained on, flown in this process."""
+    held_out = dataclasses.replace(config.trainer, num_envs=config.trainer.num_val_envs)
     apart = dataclasses.replace(
         config, trainer=held_out, seed=derive_seed(config.seed, "validation"), collector=CollectorConfig()
     )
-    return flocks_of_all_sizes(apart, policies, expert, steps=steps, stretch=stretch)
+    return make_buffers(apart, policies, expert, steps=steps, hold_steps=hold_steps)
 
 
-def named_flocks(training: Mapping[int, Part], validation: Mapping[int, Part]) -> dict[str, Any]:
+def named_buffers(training: Mapping[int, Part], validation: Mapping[int, Part]) -> dict[str, Any]:
     """All flocks of a run by the names that checkpoints give them."""
     return {
         **{str(size): group for size, group in training.items()},

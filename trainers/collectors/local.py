@@ -12,24 +12,24 @@ from torchrl.collectors import Collector
 
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.trainers.collectors.remote import RemoteFlights
+from modgnn_rl.trainers.collectors.remote import RemoteCollector
 from modgnn_rl.trainers.common.state import Tensors
 from modgnn_rl.utils.seeds import derive_seed, seeded
 
-__all__ = ["FlockCollector", "make_flights"]
+__all__ = ["FlockCollector", "make_collector"]
 
 
 class FlockCollector:
     """Flocks of one size that never stop flying, flown through TorchRL's `Collector`.
 
-    Each call of `continue_flights` goes on where they were.
+    Each call of `collect` goes on where they were.
 
     Args:
         config: the world.
         num_envs: flocks flown at once, B.
         num_agents: agents in each, N.
         behaviour: the modules that fly and label, in this order (weights changed in place are flown at once).
-        steps: steps of one call of `continue_flights`.
+        steps: steps of one call of `collect`.
         seed: seeds the environment, and the draws of modules that draw from torch's global generator.
         device: where flocks and data live.
     """
@@ -62,8 +62,8 @@ class FlockCollector:
         self._flights: Iterator[TensorDictBase] = iter(self.collector)
 
     @torch.no_grad()
-    def continue_flights(self) -> TensorDictBase:
-        """Continue the flights by some steps; flights [B, T]. Torch's global generators are left as they were."""
+    def collect(self) -> TensorDictBase:
+        """Continue the rollouts by some steps; rollouts [B, T]. Torch's global generators are left as they were."""
         seed = int(torch.randint(2**31, (), generator=self.noise))
         with seeded(seed, self.env.device):
             return next(self._flights)
@@ -74,7 +74,7 @@ class FlockCollector:
         return {"env": self.env.generator, "faults": self.env.faults.generator, "noise": self.noise}
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
-        """What a checkpoint holds of the flights."""
+        """What a checkpoint holds of the rollouts."""
         # TorchRL has no public name for what it carries from step to step, messages among it; its own numbers of
         # trajectories need not be the same.
         carried = self.collector._carrier.exclude("collector").flatten_keys("/")
@@ -84,7 +84,7 @@ class FlockCollector:
         """Go on from what `state` gave.
 
         Raises:
-            KeyError, RuntimeError: these are flights of other flocks.
+            KeyError, RuntimeError: these are rollouts of other flocks.
         """
         self.env.restore(tensors["env"])
         carried = self.collector._carrier
@@ -92,18 +92,18 @@ class FlockCollector:
         self.collector._carrier = carried.select("collector").update(found)
 
     def close(self) -> None:
-        """End the flights."""
+        """End the rollouts."""
         self.collector.shutdown()
 
 
-def make_flights(
+def make_collector(
     collector: CollectorConfig | None, config: FlockingConfig, *arguments: Any, **options: Any
-) -> FlockCollector | RemoteFlights:
+) -> FlockCollector | RemoteCollector:
     """Flocks of one size, flown in this process (also for None) or by workers; for the arguments see `FlockCollector`.
 
     Raises:
-        InputError: see `RemoteFlights`.
+        InputError: see `RemoteCollector`.
     """
     if collector is None or collector.name == "single":
         return FlockCollector(config, *arguments, **options)
-    return RemoteFlights(config, *arguments, **options, collector=collector)
+    return RemoteCollector(config, *arguments, **options, collector=collector)

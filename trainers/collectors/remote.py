@@ -19,14 +19,14 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.collectors.worker import Flight, packed, weights_of
+from modgnn_rl.trainers.collectors.worker import WorkerSpec, packed, weights_of
 from modgnn_rl.trainers.collectors.workers import ProcessWorker, RayWorker, Worker, WorkerEndedError, close_all
 from modgnn_rl.trainers.common.state import Tensors
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["RemoteFlights", "check_collector"]
+__all__ = ["RemoteCollector", "check_collector"]
 
-LIVES = 3  # times in a row that a worker may end until training does
+MAX_RESTARTS = 3  # times in a row that a worker may end until training does
 REACHING = 2.0  # longest wait for a Ray cluster to answer, s
 IDS = ("collector", "traj_ids")
 KINDS: dict[str, type[Worker]] = {"process": ProcessWorker, "ray": RayWorker}
@@ -60,7 +60,7 @@ def check_collector(config: CollectorConfig, num_envs: int) -> None:
         )
 
 
-class RemoteFlights:
+class RemoteCollector:
     """Flocks of one size that workers fly, each a part of them, in step with each other.
 
     What `modgnn_rl.trainers.collectors.local.FlockCollector` does in this process, with the same data. The first
@@ -73,9 +73,9 @@ class RemoteFlights:
         num_agents: agents in each, N.
         behaviour: the modules that fly and label, in this order; copies of them fly, and take over their state (weights
             changed in place, who flies) with each call.
-        steps: steps of one call of `continue_flights`, T.
+        steps: steps of one call of `collect`, T.
         seed: from which each worker derives its own.
-        device: where flocks fly, and where their flights are brought; between processes they pass through the CPU's
+        device: where flocks fly, and where their rollouts are brought; between processes they pass through the CPU's
             memory.
         collector: which workers.
 
@@ -102,20 +102,20 @@ class RemoteFlights:
         modules = packed(behaviour)
         shares = [num_envs // count + (index < num_envs % count) for index in range(count)]
         self._flights = [
-            Flight(config, share, num_agents, modules, steps, derive_seed(seed, "worker", index), str(device))
+            WorkerSpec(config, share, num_agents, modules, steps, derive_seed(seed, "worker", index), str(device))
             for index, share in enumerate(shares)
         ]
-        self.noise = [torch.Generator().manual_seed(derive_seed(flight.seed, "noise")) for flight in self._flights]
+        self.noise = [torch.Generator().manual_seed(derive_seed(rollout.seed, "noise")) for rollout in self._flights]
         self._replacements = [0] * count
         self._first_ids, self._next_ids = [0] * count, [0] * count
         self._workers: list[Worker] = []
         self._finalizer = weakref.finalize(self, close_all, self._workers)
         for index in range(count):
-            self._workers.append(self._hire(index))
+            self._workers.append(self._start_worker(index))
         atexit.register(self._finalizer)  # else multiprocessing would wait for workers that nobody has closed
 
-    def continue_flights(self) -> TensorDictBase:
-        """Continue the flights by some steps; flights [B, T].
+    def collect(self) -> TensorDictBase:
+        """Continue the rollouts by some steps; rollouts [B, T].
 
         Raises:
             InputError: a worker ends again and again.
@@ -124,11 +124,11 @@ class RemoteFlights:
         weights = weights_of(self.behaviour)
         seeds = [int(torch.randint(2**31, (), generator=noise)) for noise in self.noise]
         flown = self._ask_all("fly", [(weights, seed) for seed in seeds])
-        flights = [self._with_own_ids(index, flights) for index, flights in enumerate(flown)]
-        return torch.cat(flights).to(self.device)
+        rollouts = [self._with_own_ids(index, rollouts) for index, rollouts in enumerate(flown)]
+        return torch.cat(rollouts).to(self.device)
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
-        """What a checkpoint holds of the flights, worker by worker."""
+        """What a checkpoint holds of the rollouts, worker by worker."""
         states = self._ask_all("state", [()] * len(self._workers))
         return {f"worker{index}-{group}": own[group] for index, own in enumerate(states) for group in own}, {}
 
@@ -136,7 +136,7 @@ class RemoteFlights:
         """Go on from what `state` gave.
 
         Raises:
-            KeyError, RuntimeError: these are flights of other flocks, or of another number of workers.
+            KeyError, RuntimeError: these are rollouts of other flocks, or of another number of workers.
         """
         weights = weights_of(self.behaviour)
         states: list[Tensors] = [{} for _ in self._workers]
@@ -164,7 +164,7 @@ class RemoteFlights:
     def _answer(self, index: int, method: str, arguments: tuple[Any, ...]) -> Any:
         """The answer of a worker that was asked, or of the one that replaces it."""
         who = f"worker {index} of the {len(self._workers)} that fly flocks"
-        for life in range(LIVES):
+        for life in range(MAX_RESTARTS):
             if life:
                 self._workers[index].ask(method, *arguments)
             worker = self._workers[index]
@@ -172,7 +172,7 @@ class RemoteFlights:
                 return worker.answer(self.collector.timeout)
             except WorkerEndedError as error:
                 how = str(error)
-            if life < LIVES - 1:
+            if life < MAX_RESTARTS - 1:
                 warnings.warn(
                     f"{who} (process {worker.process}) has ended ({how}) and is replaced; its "
                     f"{self._flights[index].num_envs} flocks begin anew",
@@ -181,7 +181,8 @@ class RemoteFlights:
                 )
                 self._replace(index)
         raise InputError(
-            f"{who} has ended {LIVES} times in a row (at last: {how}); fewer workers (collector.workers) need less "
+            f"{who} has ended {MAX_RESTARTS} times in a row (at last: {how}); fewer workers (collector.workers) "
+            f"need less "
             "memory, slow ones a longer collector.timeout, and collector=single needs none"
         )
 
@@ -189,22 +190,22 @@ class RemoteFlights:
         ended = self._workers[index]
         self._replacements[index] += 1
         self._first_ids[index] = self._next_ids[index]
-        self._workers[index] = self._hire(index)
+        self._workers[index] = self._start_worker(index)
         close_all([ended])
 
-    def _hire(self, index: int) -> Worker:
+    def _start_worker(self, index: int) -> Worker:
         """Start a worker; one that replaces another has a seed of its own."""
-        flight = self._flights[index]
+        rollout = self._flights[index]
         if self._replacements[index]:
-            seed = derive_seed(flight.seed, "replacement", self._replacements[index])
-            flight = dataclasses.replace(flight, seed=seed)
-        return KINDS[self.collector.name](flight, self.collector.ray_address)
+            seed = derive_seed(rollout.seed, "replacement", self._replacements[index])
+            rollout = dataclasses.replace(rollout, seed=seed)
+        return KINDS[self.collector.name](rollout, self.collector.ray_address)
 
-    def _with_own_ids(self, index: int, flights: TensorDictBase) -> TensorDictBase:
-        """Flights whose trajectory ids, which each worker counts from 0, are those of no other flight."""
-        ids = flights[IDS] + self._first_ids[index]
+    def _with_own_ids(self, index: int, rollouts: TensorDictBase) -> TensorDictBase:
+        """Rollouts whose trajectory ids, which each worker counts from 0, are those of no other rollout."""
+        ids = rollouts[IDS] + self._first_ids[index]
         self._next_ids[index] = int(ids.max()) + 1
-        return flights.set(IDS, ids * len(self._workers) + index)
+        return rollouts.set(IDS, ids * len(self._workers) + index)
 
     @property
     def generators(self) -> dict[str, torch.Generator]:

@@ -46,7 +46,7 @@ def window_of(policies: Sequence[ModGNN], settings: ImitationConfig) -> int:
 
 
 def stores_messages(policy: ModGNN) -> bool:
-    """Whether a policy is trained with the messages that it received in flight; if not, windows make them anew.
+    """Whether a policy is trained with the messages that it received in closed loop; if not, windows make them anew.
 
     They must hold no trace of a parameter, and turn with a rotated state: as sums of observations do, and as all does
     that an equivariant policy sends, whose states need no rotation.
@@ -54,11 +54,11 @@ def stores_messages(policy: ModGNN) -> bool:
     return policy.sends_plain_data and (len(policy.layers) == 1 or is_equivariant(policy))
 
 
-def as_windows(flights: TensorDictBase, length: int, every: int) -> TensorDictBase:
-    """Cut flights [B, T] into overlapping windows [B * n, length] whose last steps are ``every`` steps apart."""
-    last = torch.arange(length - 1, flights.shape[1], every, device=flights.device)
-    steps = last.unsqueeze(-1) + torch.arange(1 - length, 1, device=flights.device)
-    return flights[:, steps].flatten(0, 1)
+def as_windows(rollouts: TensorDictBase, length: int, stride: int) -> TensorDictBase:
+    """Cut rollouts [B, T] into overlapping windows [B * n, length] whose last steps are ``every`` steps apart."""
+    last = torch.arange(length - 1, rollouts.shape[1], stride, device=rollouts.device)
+    steps = last.unsqueeze(-1) + torch.arange(1 - length, 1, device=rollouts.device)
+    return rollouts[:, steps].flatten(0, 1)
 
 
 def are_alike(policies: Sequence[ModGNN]) -> bool:

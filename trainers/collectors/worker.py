@@ -22,14 +22,14 @@ from torchrl.envs import EnvBase
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.parallel import make_flocks
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.collectors.behaviour import Mixture
+from modgnn_rl.trainers.collectors.behaviour import BetaMixture
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["Flight", "FlightCollector", "packed", "weights_of"]
+__all__ = ["WorkerCollector", "WorkerSpec", "packed", "weights_of"]
 
 
 @dataclass
-class Flight:
+class WorkerSpec:
     """What a worker flies; sent to it when it starts.
 
     Attributes:
@@ -115,13 +115,13 @@ def packed(behaviour: Sequence[TensorDictModuleBase]) -> bytes:
 
 
 def weights_of(behaviour: Sequence[TensorDictModuleBase]) -> bytes:
-    """The weights of modules, and whatever else is in their state, in the form that `FlightCollector.fly` takes."""
+    """The weights of modules, and whatever else is in their state, in the form that `WorkerCollector.fly` takes."""
     buffer = io.BytesIO()
     torch.save(TensorDictSequential(*behaviour).state_dict(), buffer)
     return buffer.getvalue()
 
 
-class FlightCollector(Collector):
+class WorkerCollector(Collector):
     """The collector in a worker; each method answers with its pickled result.
 
     Tensors as they are would go through shared memory, and leave a file behind when the process is killed.
@@ -130,7 +130,7 @@ class FlightCollector(Collector):
     _carrier: TensorDict
 
     def fly(self, weights: bytes, seed: int) -> bytes:
-        """Continue the flights [B, T]; they are in the memory of the CPU.
+        """Continue the rollouts [B, T]; they are in the memory of the CPU.
 
         Args:
             weights: made by `weights_of`.
@@ -142,7 +142,7 @@ class FlightCollector(Collector):
             return pickle.dumps(self.next().to("cpu"))
 
     def state(self) -> bytes:
-        """What a checkpoint holds of the flights."""
+        """What a checkpoint holds of the rollouts."""
         carried = self._carrier.exclude("collector").flatten_keys("/")
         tensors = {"env": self.env.base_env.snapshot(), "carried": dict(carried.items())}
         tensors["generators"] = {name: generator.get_state() for name, generator in self._generators.items()}
@@ -171,8 +171,8 @@ class FlightCollector(Collector):
         return {"env": env.generator, "faults": env.faults.generator, **_generators_of(self.policy)}
 
     @property
-    def _mixtures(self) -> dict[str, Mixture]:
-        found = [module for module in self.policy.modules() if isinstance(module, Mixture)]
+    def _mixtures(self) -> dict[str, BetaMixture]:
+        found = [module for module in self.policy.modules() if isinstance(module, BetaMixture)]
         return {f"mixture{number}": mixture for number, mixture in enumerate(found)}
 
     def whereabouts(self) -> bytes:

@@ -25,11 +25,11 @@ import torch
 from torchrl.collectors import MultiSyncCollector
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.collectors.worker import Flight, FlightCollector
+from modgnn_rl.trainers.collectors.worker import WorkerCollector, WorkerSpec
 
 __all__ = ["ProcessWorker", "RayWorker", "Worker", "WorkerEndedError", "close_all"]
 
-RAY_MEMORY = 256 * 2**20  # bytes that Ray's store of objects may take here: flights pass through it
+RAY_MEMORY = 256 * 2**20  # bytes that Ray's store of objects may take here: rollouts pass through it
 STARTING = 120.0  # longest wait for a worker to start, s
 PATIENCE = 5.0  # longest wait for a worker to end by itself, s
 
@@ -44,7 +44,7 @@ class Worker:
     """A TorchRL collector with one worker, and threads that wait for it, so that nobody waits for ever.
 
     Args:
-        flight: what it flies.
+        rollout: what it flies.
         address: of a Ray cluster.
 
     Attributes:
@@ -52,15 +52,15 @@ class Worker:
         started: done when it has started.
     """
 
-    def __init__(self, flight: Flight, address: str | None = None) -> None:
-        self.flight, self.address = flight, address
+    def __init__(self, rollout: WorkerSpec, address: str | None = None) -> None:
+        self.rollout, self.address = rollout, address
         self.process: int | None = None
         self.collector: Any = None
         self.started = _in_thread(self._start)
         self._answer: Future[Any] = self.started
 
     def ask(self, method: str, *arguments: Any) -> None:
-        """Begin a call of a method of the worker's `FlightCollector`."""
+        """Begin a call of a method of the worker's `WorkerCollector`."""
         self._answer = _in_thread(self._ask, method, *arguments)
 
     def answer(self, timeout: float) -> Any:
@@ -115,12 +115,12 @@ class _OneProcess(MultiSyncCollector):
     def __init__(self, worker: Worker) -> None:
         worker.collector = self
         super().__init__(
-            [worker.flight.make_env],
-            collector_class=FlightCollector,
+            [worker.rollout.make_env],
+            collector_class=WorkerCollector,
             num_threads=torch.get_num_threads(),
             auto_register_policy_transforms=True,
             total_frames=-1,
-            **worker.flight.options,
+            **worker.rollout.options,
         )
 
 
@@ -163,23 +163,23 @@ class RayWorker(Worker):
 
     host: str | None = None
 
-    def __init__(self, flight: Flight, address: str | None = None) -> None:
+    def __init__(self, rollout: WorkerSpec, address: str | None = None) -> None:
         _Ray.begin(address)
-        super().__init__(flight, address)
+        super().__init__(rollout, address)
 
     def _start(self) -> None:
         from torchrl.collectors.distributed import RayCollector
 
-        on_gpu = torch.device(self.flight.device).type != "cpu"
+        on_gpu = torch.device(self.rollout.device).type != "cpu"
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*weight", category=UserWarning)
             self.collector = RayCollector(
-                [self.flight.make_env],
-                collector_class=FlightCollector,
+                [self.rollout.make_env],
+                collector_class=WorkerCollector,
                 collector_kwargs={"auto_register_policy_transforms": True},
                 remote_configs={"num_cpus": 0 if self.address is None else 1, "num_gpus": 0.01 if on_gpu else 0},
                 sync=True,
-                **self.flight.options,
+                **self.rollout.options,
             )
         self.host, self.process = self._call("whereabouts")
 

@@ -29,15 +29,15 @@ __all__ = [
     "broadcast",
     "check_alike",
     "is_first",
-    "joined",
     "leave",
     "mean",
     "mean_and_std",
     "own_device",
     "own_part",
+    "print_rank0",
+    "process_group",
     "rank",
     "reduce_gradients",
-    "say",
     "size",
     "texts",
 ]
@@ -66,14 +66,14 @@ def is_first() -> bool:
     return rank() == 0
 
 
-def say(text: str) -> None:
+def print_rank0(text: str) -> None:
     """Print a line, in the first process only."""
     if is_first():
         print(text, flush=True)
 
 
 @contextlib.contextmanager
-def joined(device: str) -> Iterator[None]:
+def process_group(device: str) -> Iterator[None]:
     """Train together with the other processes that ``torchrun`` has started, until `leave` or the end.
 
     Args:

@@ -12,17 +12,17 @@ from modgnn_rl.configs.schema import TrainerConfig
 from modgnn_rl.errors import NotFinite
 from modgnn_rl.trainers.common import distributed
 
-__all__ = ["Stepper", "blame"]
+__all__ = ["GuardedOptimizer", "describe_nonfinite"]
 
 PATIENCE = 20  # updates in a row that may be left out
 
 
-class Stepper:
+class GuardedOptimizer:
     """Clips gradients and steps along them; what is not finite stops the training or is left out.
 
     Args:
         module: its parameters are what the optimiser moves.
-        optimizer: the gradients of each of its groups are clipped to ``settings.max_gradient``.
+        optimizer: the gradients of each of its groups are clipped to ``settings.max_grad_norm``.
         settings: of the trainer.
 
     Attributes:
@@ -54,13 +54,13 @@ class Stepper:
         norms = [nn.utils.get_total_norm([p.grad for p in group if p.grad is not None]) for group in groups]
         if torch.stack([*norms, mean_loss]).isfinite().all():
             for group, norm in zip(groups, norms, strict=True):  # not before: it would spread what is not finite
-                nn.utils.clip_grads_with_norm_(group, self.settings.max_gradient, norm)
+                nn.utils.clip_grads_with_norm_(group, self.settings.max_grad_norm, norm)
             self.gradient_norm = float(torch.stack(norms).max())
             self._in_a_row = 0
             self.optimizer.step()
             return True
         self._in_a_row += 1
-        found = distributed.texts(blame(loss, batch, self.module))
+        found = distributed.texts(describe_nonfinite(loss, batch, self.module))
         # After the reduction all have the gradient that is not finite, only one has the data.
         reason = f"update {update} was not made, {min(found, key=lambda text: 'gradient' in text)}"
         if self.settings.on_nonfinite == "stop":
@@ -72,7 +72,7 @@ class Stepper:
         return False
 
 
-def blame(loss: Tensor, batch: TensorDictBase, module: nn.Module) -> str:
+def describe_nonfinite(loss: Tensor, batch: TensorDictBase, module: nn.Module) -> str:
     """Say what it is that is not finite: an entry of the data, the loss, or the gradient of a parameter."""
     for key, value in batch["agents"].items():  # messages elsewhere may be NaN: those that nobody holds
         bad = ~value.isfinite()

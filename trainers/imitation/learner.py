@@ -19,19 +19,19 @@ from modgnn_rl.models.blocks import is_equivariant
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.trainers.collectors.windows import are_alike
 from modgnn_rl.trainers.common import distributed
-from modgnn_rl.trainers.common.optimization import Stepper
+from modgnn_rl.trainers.common.optimization import GuardedOptimizer
 from modgnn_rl.trainers.common.sampling import random_receivers
 from modgnn_rl.trainers.common.state import Tensors, moments_of, restore_moments
 from modgnn_rl.trainers.imitation.loss import hide_velocities, imitation_loss, random_rotations, rotate, stacked_losses
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["Learner", "cosine_learning_rate", "fit_together", "validate_together"]
+__all__ = ["ImitationLearner", "cosine_learning_rate", "fit_together", "validate_together"]
 
 STACKED_PAIRS = 2048  # up to this many pairs of agents in a batch, several seeds learn faster as one
 
 
-class Learner:
-    """Fits a policy to labelled flights.
+class ImitationLearner:
+    """Fits a policy to labelled rollouts.
 
     Args:
         policy: the policy that is trained.
@@ -43,19 +43,19 @@ class Learner:
     def __init__(self, policy: ModGNN, settings: ImitationConfig, updates: tuple[int, int], seed: int) -> None:
         self.policy = policy
         self.settings = settings
-        self.averaged = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.averaging))
+        self.averaged = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.ema_decay))
         self.generator = torch.Generator().manual_seed(derive_seed(seed, "learner"))
         self.validating = torch.Generator().manual_seed(derive_seed(seed, "learner", "validation"))
         self.optimizer = torch.optim.Adam([{"params": list(policy.parameters())}], lr=1.0)
         self.scheduler = LambdaLR(
             self.optimizer, lambda step: cosine_learning_rate(step, settings.learning_rates, updates)
         )
-        self.stepper = Stepper(policy, self.optimizer, settings)
+        self.guarded_optimizer = GuardedOptimizer(policy, self.optimizer, settings)
         self.turns = settings.rotate and not is_equivariant(policy)
         self.updates_done = 0
 
     @property
-    def flown(self) -> ModGNN:
+    def ema_policy(self) -> ModGNN:
         """The moving average of the policy: it collects, is evaluated and is what a run ends with."""
         return cast(ModGNN, self.averaged.module)
 
@@ -92,7 +92,7 @@ class Learner:
             hide_velocities(batch, settings.hide_velocity, generator)
         controlled = batch["agents", "controlled"][:, -1]
         # At any size as many links as at 32 agents, so that an update takes as long.
-        count = max(1, round(settings.receivers * REFERENCE_SIZE / controlled.shape[-1]))
+        count = max(1, round(settings.agents_per_state * REFERENCE_SIZE / controlled.shape[-1]))
         return random_receivers(controlled, count, generator)
 
     def step(self, loss: Tensor, batch: TensorDictBase, receivers: Tensor) -> None:
@@ -104,14 +104,14 @@ class Learner:
             receivers: the agents that count, bool [S, N].
         """
         self.updates_done += 1
-        if self.stepper.step(self.updates_done, loss, batch, receivers.sum()):
+        if self.guarded_optimizer.step(self.updates_done, loss, batch, receivers.sum()):
             self.scheduler.step()
             self.averaged.update_parameters(self.policy)
 
     @property
     def gradient_norm(self) -> float:
         """Norm of the last gradient, before it was clipped."""
-        return self.stepper.gradient_norm
+        return self.guarded_optimizer.gradient_norm
 
     @property
     def generators(self) -> dict[str, torch.Generator]:
@@ -121,7 +121,7 @@ class Learner:
     def state(self) -> tuple[Tensors, dict[str, Any]]:
         """What a checkpoint holds of the learner: named tensors, and plain values."""
         tensors = {
-            "policy": self.flown.state_dict(),
+            "policy": self.ema_policy.state_dict(),
             "trained": self.policy.state_dict(),
             "optimizer": moments_of(self.optimizer),
         }
@@ -135,7 +135,7 @@ class Learner:
             KeyError, RuntimeError: it is that of another policy.
         """
         self.policy.load_state_dict(tensors["trained"])
-        self.flown.load_state_dict(tensors["policy"])
+        self.ema_policy.load_state_dict(tensors["policy"])
         self.averaged.n_averaged.fill_(values["averaged"])
         restore_moments(self.optimizer, tensors["optimizer"])
         self.updates_done = int(values["updates"])
@@ -144,7 +144,7 @@ class Learner:
         self.scheduler._last_lr = [rate]
 
 
-def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int) -> list[float]:
+def fit_together(learners: Sequence[ImitationLearner], buffer: ReplayBuffer, updates: int) -> list[float]:
     """Let learners take optimiser steps on the same batches, with the same rotations and agents that count.
 
     The data are read once. Of several learners the first draws. Seeds of one model are computed at once where the
@@ -180,12 +180,12 @@ def fit_together(learners: Sequence[Learner], buffer: ReplayBuffer, updates: int
 
 
 @torch.no_grad()
-def validate_together(learners: Sequence[Learner], buffer: ReplayBuffer) -> list[float]:
+def validate_together(learners: Sequence[ImitationLearner], buffer: ReplayBuffer) -> list[float]:
     """The loss of the averaged policy of each learner, on one batch of held-out data of each process."""
     batch = buffer.sample()
     first = learners[0]
     receivers = first.prepare(batch, first.validating, turn=any(learner.turns for learner in learners))
-    losses = [float(imitation_loss(learner.flown, batch, receivers)) for learner in learners]
+    losses = [float(imitation_loss(learner.ema_policy, batch, receivers)) for learner in learners]
     return list(distributed.mean(dict(enumerate(losses))).values())
 
 

@@ -83,7 +83,7 @@ def stacked_losses(
 def hide_velocities(batch: TensorDictBase, share: float, generator: torch.Generator) -> None:
     """Zero the velocities of all agents in a random share of the windows [S, W], in place.
 
-    A cloned policy that reads its next action off its own velocity, a memory of the last one, runs away in flight.
+    A cloned policy that reads its next action off its own velocity, a memory of the last one, runs away in rollout.
 
     Args:
         batch: with observations (position, velocity) [S, W, N, 6], and without stored messages.

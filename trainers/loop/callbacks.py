@@ -32,12 +32,12 @@ class Callback:
             policies: what will be returned at the end, by name; their weights change while training goes on.
         """
 
-    def on_flights(self, index: int, flights: TensorDictBase) -> None:
-        """Flights of a round have come in and are not yet learned from.
+    def on_flights(self, index: int, rollouts: TensorDictBase) -> None:
+        """Rollouts of a round have come in and are not yet learned from.
 
         Args:
             index: number of the round.
-            flights: [B, T]; what is changed in place is learned from.
+            rollouts: [B, T]; what is changed in place is learned from.
         """
 
     def on_round(self, index: int, metrics: Mapping[str, float]) -> bool | None:

@@ -10,22 +10,22 @@ from tensordict.nn import TensorDictModuleBase
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.tracking.checkpoint import Checkpoint
-from modgnn_rl.tracking.loggers import Dashboards
+from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
-from modgnn_rl.utils.signals import Interruption
+from modgnn_rl.utils.signals import GracefulInterrupt
 
-__all__ = ["Session"]
+__all__ = ["TrainContext"]
 
 
 @dataclass
-class Session:
+class TrainContext:
     """One training run, or what is left of it.
 
     Attributes:
         config: the run's settings.
         run: the folder to leave metrics and checkpoints in.
-        dashboards: where metrics go besides.
+        loggers: where metrics go besides.
         expert: writes ``("agents", "expert_action")``; default: Reynolds flocking.
         callbacks: people's own code.
         checkpoint: what the run goes on from; None: it begins.
@@ -35,12 +35,12 @@ class Session:
 
     config: TrainConfig
     run: RunFolder
-    dashboards: Dashboards
+    loggers: LoggerGroup
     expert: TensorDictModuleBase = None
     callbacks: Sequence[Callback] = ()
     checkpoint: Checkpoint | None = None
     keeps_flocks: bool = True
-    interruption: Interruption = field(default_factory=Interruption)
+    interruption: GracefulInterrupt = field(default_factory=GracefulInterrupt)
 
     def __post_init__(self) -> None:
         """Choose the expert."""

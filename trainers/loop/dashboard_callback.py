@@ -1,4 +1,4 @@
-"""What a dashboard shows of a training beyond its metrics: reference flights, actions, films, the final table."""
+"""What a dashboard shows of a training beyond its metrics: reference rollouts, actions, films, the final table."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
 from modgnn_rl.errors import one_line
-from modgnn_rl.evaluation.rollout import Flights, fly, reference_policies
+from modgnn_rl.evaluation.rollout import EpisodeMetrics, reference_policies, rollout
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.tracking.loggers import Dashboards
+from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.utils.seeds import derive_seed, seeded
 from modgnn_rl.visualization.video import check_video, film, write_video
 
-__all__ = ["Watch", "log_evaluation"]
+__all__ = ["DashboardCallback", "log_evaluation"]
 
-STEPS = 200  # of a reference flight and of a film
+STEPS = 200  # of a reference rollout and of a film
 FLOCKS = 4  # of 32 agents; of more agents there are fewer
 CHART_ROUNDS = 10  # rounds between which reference lines are drawn on
 MOST_ACTIONS = 30_000  # components in a histogram
 
 
-class Watch(Callback):
+class DashboardCallback(Callback):
     """Shows on dashboards how others fly, how the policy acts, and films of it.
 
     The training is the same with it and without it, to the last bit. What of it fails is left out from then on, with
@@ -37,7 +37,7 @@ class Watch(Callback):
     Args:
         config: the run's settings.
         run: the run folder; films go into ``videos/`` there.
-        dashboards: where to show it.
+        loggers: where to show it.
         expert: whom the policy learns from; default: Reynolds flocking.
     """
 
@@ -45,10 +45,10 @@ class Watch(Callback):
         self,
         config: TrainConfig,
         run: RunFolder,
-        dashboards: Dashboards,
+        loggers: LoggerGroup,
         expert: TensorDictModuleBase | None = None,
     ) -> None:
-        self.config, self.run, self.dashboards, self.expert = config, run, dashboards, expert
+        self.config, self.run, self.loggers, self.expert = config, run, loggers, expert
         self.policies: Mapping[str, ModGNN] = {}
         self.lines: dict[str, dict[str, float]] = {}  # of each metric, by the name of who flies
         self.shown: set[str] = set()  # metrics with lines
@@ -58,13 +58,13 @@ class Watch(Callback):
     def on_start(self, policies: Mapping[str, ModGNN]) -> None:
         """Fly the reference policies, and see whether films can be made."""
         self.policies = policies
-        self._attempt("reference flights", self._fly_references)
+        self._attempt("reference rollouts", self._fly_references)
         if self._makes_films:
             self._attempt("films", check_video)
 
-    def on_flights(self, index: int, flights: TensorDictBase) -> None:
+    def on_flights(self, index: int, rollouts: TensorDictBase) -> None:
         """Show how the components of the flown actions are distributed, m/s."""
-        self._attempt("actions", lambda: self._show_actions(index, flights))
+        self._attempt("actions", lambda: self._show_actions(index, rollouts))
 
     def on_round(self, index: int, metrics: Mapping[str, float]) -> None:
         """Draw the reference lines on, and make a film where it is time."""
@@ -86,11 +86,11 @@ class Watch(Callback):
 
     @property
     def _makes_films(self) -> bool:
-        return self.config.video_rounds > 0 and self.dashboards.shows_videos
+        return self.config.video_rounds > 0 and self.loggers.shows_videos
 
     def _attempt(self, what: str, action: Callable[[], Any]) -> None:
         """Do something that must neither stop the training nor draw from its random numbers."""
-        if what in self._failed or not self.dashboards:
+        if what in self._failed or not self.loggers:
             return
         try:
             with seeded(derive_seed(self.config.seed, "watching"), self.config.device):
@@ -104,14 +104,14 @@ class Watch(Callback):
             )
 
     def _fly_references(self) -> None:
-        """Measure the flights of the reference policies at each size."""
-        world = self.config.env
-        for size in world.sizes:
+        """Measure the rollouts of the reference policies at each size."""
+        env_config = self.config.env
+        for size in env_config.sizes:
             rows = {
                 name: _measures(
-                    fly(
+                    rollout(
                         policy,
-                        world,
+                        env_config,
                         num_agents=size,
                         num_flocks=max(1, FLOCKS * REFERENCE_SIZE // size),
                         steps=self._steps,
@@ -121,14 +121,14 @@ class Watch(Callback):
                     ),
                     self._steps,
                 )
-                for name, policy in reference_policies(world, self.expert).items()
+                for name, policy in reference_policies(env_config, self.expert).items()
             }
             measures = list(next(iter(rows.values())))
             self.lines |= {f"{size}/{name}": {who: row[name] for who, row in rows.items()} for name in measures}
             table: list[list[str | float]] = [[who, *row.values()] for who, row in rows.items()]
-            self.dashboards.log_table(f"references/{size}", ["flown by", *measures], table)
+            self.loggers.log_table(f"references/{size}", ["flown by", *measures], table)
         for name in ("error", "reward"):
-            lines = [self.lines[f"{size}/{name}"] for size in world.sizes]
+            lines = [self.lines[f"{size}/{name}"] for size in env_config.sizes]
             self.lines[name] = {who: sum(line[who] for line in lines) / len(lines) for who in lines[0]}
 
     @property
@@ -140,20 +140,20 @@ class Watch(Callback):
         return metric if metric in self.lines else "/".join(metric.split("/")[-2:])
 
     def _draw_lines(self) -> None:
-        self.dashboards.log_references(self.last, {name: self.lines[self._line(name)] for name in sorted(self.shown)})
+        self.loggers.log_references(self.last, {name: self.lines[self._line(name)] for name in sorted(self.shown)})
 
-    def _show_actions(self, index: int, flights: TensorDictBase) -> None:
-        flown = flights["agents", "action"][flights["agents", "controlled"]].flatten()
-        size = flights["agents", "action"].shape[-2]
-        self.dashboards.log_histogram(index, f"{size}/actions", flown[:: max(1, len(flown) // MOST_ACTIONS)])
+    def _show_actions(self, index: int, rollouts: TensorDictBase) -> None:
+        flown = rollouts["agents", "action"][rollouts["agents", "controlled"]].flatten()
+        size = rollouts["agents", "action"].shape[-2]
+        self.loggers.log_histogram(index, f"{size}/actions", flown[:: max(1, len(flown) // MOST_ACTIONS)])
 
     def _film(self) -> None:
-        """Film the first policy with the first size; always the same flight, so that films can be compared."""
-        world, folder = self.config.env, self.run.path / "videos"
-        size = world.sizes[0]
+        """Film the first policy with the first size; always the same rollout, so that films can be compared."""
+        env_config, folder = self.config.env, self.run.path / "videos"
+        size = env_config.sizes[0]
         frames = film(
             next(iter(self.policies.values())),
-            world,
+            env_config,
             num_agents=size,
             steps=self._steps,
             seed=derive_seed(self.config.seed, "references", size),
@@ -161,27 +161,27 @@ class Watch(Callback):
         )
         folder.mkdir(exist_ok=True)
         path = folder / f"round_{self.last:05d}.mp4"
-        write_video(path, frames, world.control_frequency)
+        write_video(path, frames, env_config.control_frequency)
         self.filmed = self.last
-        self.dashboards.log_video(self.last, f"{size}/flight", path)
+        self.loggers.log_video(self.last, f"{size}/rollout", path)
 
 
-def _measures(flights: Flights, steps: int) -> dict[str, float]:
-    """Figures of flights by the names that trainers give to those of the policy's own."""
-    names = ("error", "leader_distance", "cohesion", "separation", "near_collisions", "lost", "diverged")
-    means = {name: float(getattr(flights, name).double().mean()) for name in names}
-    smallest, reward = float(flights.smallest_distance.min()), float(flights.reward.mean()) / steps
-    return {**means, "smallest_distance": smallest, "reward": reward}
+def _measures(rollouts: EpisodeMetrics, steps: int) -> dict[str, float]:
+    """Figures of rollouts by the names that trainers give to those of the policy's own."""
+    names = ("error", "leader_distance", "cohesion", "separation", "collision_rate", "lost", "diverged")
+    means = {name: float(getattr(rollouts, name).double().mean()) for name in names}
+    smallest, reward = float(rollouts.min_distance.min()), float(rollouts.reward.mean()) / steps
+    return {**means, "min_distance": smallest, "reward": reward}
 
 
-def log_evaluation(dashboards: Dashboards, tables: Mapping[int, Mapping[str, Any]]) -> None:
-    """Show the evaluation on dashboards, a table for each number of agents.
+def log_evaluation(loggers: LoggerGroup, tables: Mapping[int, Mapping[str, Any]]) -> None:
+    """Show the evaluation on loggers, a table for each number of agents.
 
     Args:
-        dashboards: where.
-        tables: by number of agents, as `modgnn_rl.evaluation.table.summarise_flights` makes them.
+        loggers: where.
+        tables: by number of agents, as `modgnn_rl.evaluation.table.summarise_rollouts` makes them.
     """
-    means = ("error", "leader_distance", "cohesion", "separation", "near_collisions", "reward")
+    means = ("error", "leader_distance", "cohesion", "separation", "collision_rate", "reward")
     plain = ("smallest_distance_ever", "lost", "diverged")
     columns = ["flown by", "error", "error, low", "error, high", *means[1:], *plain]
     for size, table in tables.items():
@@ -191,4 +191,4 @@ def log_evaluation(dashboards: Dashboards, tables: Mapping[int, Mapping[str, Any
             figures = [error.get(key, math.nan) for key in ("mean", "low", "high")]
             figures += [other.get("mean", math.nan) for other in others]
             rows.append([name, *figures, *(float(row[name]) for name in plain)])
-        dashboards.log_table(f"evaluation/{size}", columns, rows)
+        loggers.log_table(f"evaluation/{size}", columns, rows)

@@ -1,4 +1,4 @@
-"""What is measured on the flights that trainers collect."""
+"""What is measured on the rollouts that trainers collect."""
 
 from __future__ import annotations
 
@@ -10,74 +10,74 @@ from modgnn_rl.envs.flocking.metrics import (
     action_error,
     cohesion,
     is_diverged,
-    is_lost,
     leader_distance,
+    leader_lost,
+    min_distance,
     separation,
-    smallest_distance,
 )
 from modgnn_rl.envs.flocking.rewards import flocking_costs
 from modgnn_rl.utils.tensors import pair_distances
 
-__all__ = ["flight_metrics", "reward_metrics"]
+__all__ = ["reward_metrics", "rollout_metrics"]
 
-FRAMES = 4  # steps of a batch of flights at which the geometry is measured
+FRAMES = 4  # steps of a batch of rollouts at which the geometry is measured
 
 
-def flight_metrics(flights: TensorDictBase, world: FlockingConfig) -> dict[str, float]:
-    """Metrics of flights that a trainer collected; names begin with the number of agents.
+def rollout_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dict[str, float]:
+    """Metrics of rollouts that a trainer collected; names begin with the number of agents.
 
     Args:
-        flights: [B, T]; where the expert flew some, with who did under ``expert_flies`` [B, T, 1].
-        world: says when a flock has diverged or is lost.
+        rollouts: [B, T]; where the expert flew some, with who did under ``expert_flies`` [B, T, 1].
+        env_config: says when a flock has diverged or is lost.
 
     Returns:
         the error of the actions where the policy flew (NaN where the expert flew throughout), and at a few steps,
         whoever flew, the other metrics of `modgnn_rl.envs.flocking.metrics`.
     """
-    agents = flights["agents"]
-    flown, expert_flies = agents["controlled"], flights.get("expert_flies", None)
+    agents = rollouts["agents"]
+    flown, expert_flies = agents["controlled"], rollouts.get("expert_flies", None)
     if expert_flies is not None:
         flown = flown & ~expert_flies
     error = action_error(agents.get("loc", agents["action"]), agents["expert_action"], flown).nanmean()
-    frames = torch.linspace(0, flights.shape[1] - 1, FRAMES).long()
-    position = flights[world.state_key][:, frames, :, :3]
+    frames = torch.linspace(0, rollouts.shape[1] - 1, FRAMES).long()
+    position = rollouts[env_config.state_key][:, frames, :, :3]
     measured = {
         "error": error,
         "leader_distance": leader_distance(position).mean(),
         "cohesion": cohesion(position).mean(),
         "separation": separation(position).mean(),
-        "smallest_distance": smallest_distance(position).min(),
-        "lost": is_lost(position, world.comm_range).double().mean(),
-        "diverged": is_diverged(position, world.max_distance).double().mean(),
+        "min_distance": min_distance(position).min(),
+        "lost": leader_lost(position, env_config.comm_range).double().mean(),
+        "diverged": is_diverged(position, env_config.max_distance).double().mean(),
     }
     if expert_flies is not None:
         measured["expert_flew"] = expert_flies.double().mean()
     return {f"{position.shape[-2]}/{name}": float(value) for name, value in measured.items()}
 
 
-def reward_metrics(flights: TensorDictBase, world: FlockingConfig) -> dict[str, float]:
+def reward_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dict[str, float]:
     """Mean reward of a step and of an agent that is flown, and each cost that makes it up, unweighted.
 
     Args:
-        flights: [B, T].
-        world: its weights.
+        rollouts: [B, T].
+        env_config: its weights.
 
     Returns:
         by name; names begin with the number of agents.
     """
-    state = flights["next", *world.state_key]
+    state = rollouts["next", *env_config.state_key]
     position, velocity = state.split(3, -1)
-    exists = flights.get(("agents", "mask"), None)
+    exists = rollouts.get(("agents", "mask"), None)
     costs = flocking_costs(
         position,
         velocity,
-        flights["agents", "action"],
+        rollouts["agents", "action"],
         pair_distances(position.flatten(0, 1)).amin(-1).view(position.shape[:-1]),
-        crowding_distance=world.crowding_distance,
-        collision_distance=world.collision_distance,
+        crowding_distance=env_config.crowding_distance,
+        collision_distance=env_config.collision_distance,
         exists=exists,
     )
-    flown = flights["agents", "controlled"]
+    flown = rollouts["agents", "controlled"]
     measured = {f"cost/{name}": cost[flown].mean() for name, cost in costs.items()}
-    measured["reward"] = flights["next", "agents", "reward"][flown].mean()
+    measured["reward"] = rollouts["next", "agents", "reward"][flown].mean()
     return {f"{position.shape[-2]}/{name}": float(value) for name, value in measured.items()}

@@ -15,7 +15,7 @@ from modgnn_rl.configs.schema import (
     TrainerConfig,
     as_list,
 )
-from modgnn_rl.data.dataset import FlightDataset
+from modgnn_rl.data.dataset import EpisodeDataset
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.registry import configured_model
@@ -25,16 +25,16 @@ from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.collectors.flocks import flocks_of
 from modgnn_rl.trainers.collectors.remote import check_collector
 from modgnn_rl.trainers.collectors.windows import window_of
-from modgnn_rl.trainers.imitation.learner import Learner
-from modgnn_rl.trainers.ppo.learner import improvement_window
+from modgnn_rl.trainers.imitation.learner import ImitationLearner
+from modgnn_rl.trainers.ppo.learner import ppo_window
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["DART_PARTS", "check_training", "initial_policy", "make_learner", "settle_model", "side_by_side"]
+__all__ = ["DART_PARTS", "check_training", "initial_policy", "make_learner", "resolve_model", "side_by_side"]
 
-DART_PARTS = 4  # parts of the flights between which the noise is set anew
+DART_PARTS = 4  # parts of the rollouts between which the noise is set anew
 
 
-def make_learner(config: TrainConfig, updates: tuple[int, int], member: int = 0) -> Learner:
+def make_learner(config: TrainConfig, updates: tuple[int, int], member: int = 0) -> ImitationLearner:
     """The learner of a run, or one of several that differ in the weights that they begin with.
 
     Args:
@@ -42,7 +42,7 @@ def make_learner(config: TrainConfig, updates: tuple[int, int], member: int = 0)
         updates: updates until the first cosine of the learning rate ends, and of the whole run.
         member: which of several.
     """
-    return Learner(initial_policy(config, member), config.trainer, updates, config.seed)
+    return ImitationLearner(initial_policy(config, member), config.trainer, updates, config.seed)
 
 
 def initial_policy(config: TrainConfig, member: int = 0) -> ModGNN:
@@ -77,7 +77,7 @@ def side_by_side(config: TrainConfig) -> dict[str, TrainConfig]:
     return members if len(members) > 1 else {member.model.name: member for member in members.values()}
 
 
-def settle_model(config: TrainConfig) -> TrainConfig:
+def resolve_model(config: TrainConfig) -> TrainConfig:
     """The settings with the model of the run that training begins with, or the first of several trained side by side.
 
     Raises:
@@ -110,11 +110,11 @@ def _members(config: TrainConfig) -> list[TrainConfig]:
 
 
 def _check_flights(settings: TrainerConfig, policies: Sequence[ModGNN]) -> None:
-    """Refuse flights shorter than the windows that are cut from them."""
+    """Refuse rollouts shorter than the windows that are cut from them."""
     if isinstance(settings, MAPPOConfig):
-        name, steps, needed = "round_steps", settings.round_steps, improvement_window(policies[0], settings)[1]
+        name, steps, needed = "steps_per_round", settings.steps_per_round, ppo_window(policies[0], settings)[1]
     elif isinstance(settings, DAggerConfig):
-        name, steps, needed = "round_steps", settings.round_steps, window_of(policies, settings)
+        name, steps, needed = "steps_per_round", settings.steps_per_round, window_of(policies, settings)
     elif isinstance(settings, BCConfig) and not settings.dataset:
         parts = DART_PARTS if settings.dart else 1
         name, steps, needed = "cloning_steps", settings.cloning_steps, parts * window_of(policies, settings)
@@ -132,8 +132,8 @@ def check_training(config: TrainConfig) -> None:
 
     Raises:
         InputError: sizes that repeat or hold no agent to train, too few updates for the sizes, a model with nothing to
-            learn, several policies that would begin alike, flights too short to learn from, agents that do not fit into
-            the ball they start in, or a dataset that is damaged or does not fit.
+            learn, several policies that would begin alike, rollouts too short to learn from, agents that do not fit
+            into the ball they start in, or a dataset that is damaged or does not fit.
     """
     settings: TrainerConfig = config.trainer
     sizes = config.env.sizes
@@ -141,7 +141,7 @@ def check_training(config: TrainConfig) -> None:
         raise InputError(
             f"env.num_agents={sizes} must name each size once, and none below 2: the leader is not trained"
         )
-    for name in ("cloning_updates", "round_updates"):
+    for name in ("cloning_updates", "updates_per_round"):
         updates = getattr(settings, name, None)
         if updates and updates < len(sizes):
             raise InputError(f"trainer.{name}={updates} is too few for {len(sizes)} sizes; give at least one to each")
@@ -160,10 +160,11 @@ def check_training(config: TrainConfig) -> None:
         with contextlib.closing(FlockingEnv(1, size, config=config.env, seed=config.seed)) as env:
             env.reset()
     if isinstance(settings, BCConfig) and settings.dataset:
-        dataset = FlightDataset.open(settings.dataset)
+        dataset = EpisodeDataset.open(settings.dataset)
         dataset.check_world(config.env)
-        if dataset.episodes <= settings.held_out:
+        if dataset.episodes <= settings.num_val_envs:
             raise InputError(
-                f"trainer.held_out={settings.held_out} leaves nothing to train on of the {dataset.episodes} episodes "
+                f"trainer.num_val_envs={settings.num_val_envs} leaves nothing to train on of the "
+                f"{dataset.episodes} episodes "
                 f"in {settings.dataset}; lower it, or collect more"
             )

@@ -19,17 +19,17 @@ from modgnn_rl.configs.schema import TrainerConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.checkpoint import save_checkpoint
-from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer
 from modgnn_rl.trainers.collectors.local import FlockCollector
-from modgnn_rl.trainers.collectors.remote import RemoteFlights
+from modgnn_rl.trainers.collectors.remote import RemoteCollector
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.state import Part, gather, scatter
 from modgnn_rl.trainers.loop.callbacks import Callback
-from modgnn_rl.trainers.loop.context import Session
+from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.utils.signals import Stopped
 
-__all__ = ["Journal", "Learns"]
+__all__ = ["Learns", "TrainingLoop"]
 
 BEST_ROUNDS = 5  # rounds over which scores are averaged
 SAVING_SHARE = 1 / 70  # of the time goes into checkpoints at most: large data are written less often
@@ -41,18 +41,18 @@ class Learns(Part, Protocol):
     updates_done: int
 
     @property
-    def flown(self) -> ModGNN:
+    def ema_policy(self) -> ModGNN:
         """The policy so far."""
 
 
-class Journal:
+class TrainingLoop:
     """Counts the rounds of a run, writes their metrics and checkpoints, and calls the callbacks.
 
     A run that goes on from a checkpoint begins with all as it was there, once the journal is entered. Where several
     processes train together, the first alone writes, and metrics are means over all.
 
     Args:
-        session: the run.
+        context: the run.
         learners: by name; the first is the one that `modgnn_rl.load_policy` finds.
         flocks: the flocks flown, by name; they are closed at the end.
         total: updates, or what else ``unit`` says, of the whole run.
@@ -66,17 +66,17 @@ class Journal:
 
     def __init__(
         self,
-        session: Session,
+        context: TrainContext,
         learners: Mapping[str, Learns],
-        flocks: Mapping[str, Flocks | FlockCollector | RemoteFlights],
+        flocks: Mapping[str, FlockBuffer | FlockCollector | RemoteCollector],
         total: int,
         *,
         unit: str = "updates",
     ) -> None:
-        self.session, self.learners, self.flocks = session, dict(learners), dict(flocks)
-        self.settings: TrainerConfig = session.config.trainer
-        self.run, self.callbacks = session.run, session.callbacks
-        self.memory: dict[str, Any] = {}
+        self.context, self.learners, self.flocks = context, dict(learners), dict(flocks)
+        self.settings: TrainerConfig = context.config.trainer
+        self.run, self.callbacks = context.run, context.callbacks
+        self.state: dict[str, Any] = {}
         self.round = self.step = self.count = 0
         self.total, self.unit = total, unit
         self._wants_to_stop = False
@@ -89,9 +89,9 @@ class Journal:
     @property
     def policies(self) -> dict[str, ModGNN]:
         """The policies so far, by the learners' names."""
-        return {name: learner.flown for name, learner in self.learners.items()}
+        return {name: learner.ema_policy for name, learner in self.learners.items()}
 
-    def __enter__(self) -> Journal:
+    def __enter__(self) -> TrainingLoop:
         """Go on from the checkpoint, if there is one, and start the progress bar."""
         self._restore()
         distributed.broadcast(self._weights())
@@ -107,7 +107,7 @@ class Journal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop progress bar and flights; unless something went wrong, write the last checkpoint."""
+        """Stop progress bar and rollouts; unless something went wrong, write the last checkpoint."""
         if distributed.is_first():
             self.progress.__exit__(kind, error, trace)
         try:
@@ -130,7 +130,7 @@ class Journal:
         Raises:
             modgnn_rl.utils.signals.Stopped: after the round in which a signal came, and after its checkpoint.
         """
-        interruption = self.session.interruption
+        interruption = self.context.interruption
         advice = "Stopping after this round, with a checkpoint; once more stops at once, without one."
         with interruption.deferred(advice if distributed.is_first() else ""):
             while first + self.round <= last and not self._wants_to_stop:
@@ -150,13 +150,13 @@ class Journal:
                 if is_due:
                     self._save()
 
-    def show(self, flights: TensorDictBase) -> TensorDictBase:
-        """Show flights of this round to the callbacks before they are learned from; returns them."""
+    def on_collect(self, rollouts: TensorDictBase) -> TensorDictBase:
+        """Show rollouts of this round to the callbacks before they are learned from; returns them."""
         for callback in self.callbacks:
-            callback.on_flights(self.step, flights)
-        return flights
+            callback.on_flights(self.step, rollouts)
+        return rollouts
 
-    def note(
+    def log(
         self, metrics: Mapping[str, float], count: int, scores: Mapping[str, float], **figures: float | str
     ) -> None:
         """Record the metrics of this round.
@@ -177,7 +177,7 @@ class Journal:
     def _record(
         self, metrics: Mapping[str, float], count: int, scores: Mapping[str, float], figures: Mapping[str, float | str]
     ) -> None:
-        """Write the metrics of this round wherever they are looked at; see `note`."""
+        """Write the metrics of this round wherever they are looked at; see `log`."""
         for name, score in scores.items():
             self._scores.setdefault(name, []).extend([score] if math.isfinite(score) else [])
         self._unwritten.append((self.step, dict(metrics)))
@@ -185,7 +185,7 @@ class Journal:
         now = time.monotonic()
         speed = {"time/round": now - self._noted_at, f"time/{self.unit}_per_second": count / (now - self._noted_at)}
         self._noted_at = now
-        self.session.dashboards.log(self.step, {**metrics, **speed})
+        self.context.loggers.log(self.step, {**metrics, **speed})
         self.progress.update(count, **figures)
 
     def _write_metrics(self, *, last: bool = False) -> None:
@@ -230,7 +230,7 @@ class Journal:
             if score >= self._best.get(name, math.inf):
                 continue
             folder = self.run.best if len(self._scores) == 1 else self.run.path / name / "best"
-            policy = {"policy": self.learners[name].flown.state_dict()}
+            policy = {"policy": self.learners[name].ema_policy.state_dict()}
             try:
                 save_checkpoint(folder, self.round, policy, {"score": score}, keep=1)
                 self._best[name] = score
@@ -253,7 +253,7 @@ class Journal:
             "learners": list(self.learners),
             "round": self.round,
             "count": self.count,
-            "memory": self.memory,
+            "memory": self.state,
             "callbacks": {name: callback.state() for name, callback in self._named_callbacks()},
             "best": self._best,
             "scores": self._scores,
@@ -262,8 +262,8 @@ class Journal:
         }
 
     def _restore(self) -> None:
-        """Go on from the session's checkpoint, or begin."""
-        checkpoint = self.session.checkpoint
+        """Go on from the context's checkpoint, or begin."""
+        checkpoint = self.context.checkpoint
         first = distributed.is_first()
         if checkpoint is None:
             if first:
@@ -271,9 +271,9 @@ class Journal:
             return
         values = checkpoint.state
         try:
-            scatter(self._parts(with_flocks=self.session.keeps_flocks), checkpoint, with_generators=first)
+            scatter(self._parts(with_flocks=self.context.keeps_flocks), checkpoint, with_generators=first)
             self.round = self._saved = int(values["round"])
-            self.count, self.memory, self._best = int(values["count"]), values["memory"], values["best"]
+            self.count, self.state, self._best = int(values["count"]), values["memory"], values["best"]
             self._scores = values["scores"]
             self._seconds = float(values["seconds"])
             for name, callback in self._named_callbacks():

@@ -12,12 +12,12 @@ from torchrl.objectives import MAPPOLoss
 
 from modgnn_rl.trainers.common import distributed
 
-__all__ = ["ANCHOR", "AnchoredMAPPOLoss", "SharedValueNorm"]
+__all__ = ["ANCHOR", "KLPenaltyMAPPOLoss", "SharedValueNorm"]
 
 ANCHOR = ("agents", "anchor")
 
 
-class AnchoredMAPPOLoss(MAPPOLoss):
+class KLPenaltyMAPPOLoss(MAPPOLoss):
     """TorchRL's `MAPPOLoss` with a pull towards the actions of another policy.
 
     Where the data have its actions under ``anchor`` [*B, N, A], the result has also ``loss_anchor``: ``anchor_coeff``

@@ -194,7 +194,7 @@ class GymnasiumFlocking(gymnasium.Env[Observation, Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin a flight; returns observation and info."""
+        """Begin a rollout; returns observation and info."""
         super().reset(seed=seed)
         data = self._flocks.reset(seed, options)
         self._show()
@@ -228,7 +228,7 @@ class GymnasiumFlocking(gymnasium.Env[Observation, Array]):
 class GymnasiumFlocks(VectorEnv[Observation, Array, Array]):
     """Many flocks as Gymnasium's vector environment, flown in one batch; see `GymnasiumFlocking`.
 
-    A flock whose flight is over begins anew in the same step; the end is in ``info["final_obs"]`` and
+    A flock whose rollout is over begins anew in the same step; the end is in ``info["final_obs"]`` and
     ``info["final_info"]`` then. All flocks draw from one seed.
 
     Args:
@@ -265,7 +265,7 @@ class GymnasiumFlocks(VectorEnv[Observation, Array, Array]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin all flights; several seeds are made one."""
+        """Begin all rollouts; several seeds are made one."""
         if seed is not None and not isinstance(seed, int):
             seed = derive_seed(0, *map(str, seed))
         super().reset(seed=seed)
@@ -273,7 +273,7 @@ class GymnasiumFlocks(VectorEnv[Observation, Array, Array]):
         return self._flocks.observe(data), self._flocks.describe(data)
 
     def step(self, actions: Array) -> tuple[Observation, Array, Array, Array, dict[str, Any]]:
-        """Fly one control period; flights that end begin anew."""
+        """Fly one control period; rollouts that end begin anew."""
         data = self._flocks.step(actions)
         observation, info = self._flocks.observe(data), self._flocks.describe(data)
         rewards, done = self._flocks.rewards(data), as_array(data["done"].squeeze(-1)).astype(bool)

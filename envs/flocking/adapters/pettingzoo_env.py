@@ -29,7 +29,7 @@ class PettingZooFlocking(ParallelEnv[str, dict[str, Array], Array]):
 
     Each observes a Dict: ``observation`` [6], its own position, m, and velocity, m/s; ``heard`` [N], whom it hears now,
     the leader first; ``neighbours`` [N, 6], their observations, zero where it hears nothing. It acts by a target
-    velocity [3], m/s, and gets its own reward. All flights end together.
+    velocity [3], m/s, and gets its own reward. All rollouts end together.
 
     Args:
         num_agents: agents N, the leader included; at least 2.
@@ -80,7 +80,7 @@ class PettingZooFlocking(ParallelEnv[str, dict[str, Array], Array]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, dict[str, Array]], dict[str, dict[str, Any]]]:
-        """Begin a flight; returns observations and infos. Of the options only ``state`` is read, as is usual there."""
+        """Begin a rollout; returns observations and infos. Of the options only ``state`` is read, as is usual there."""
         data = self._flocks.reset(seed, {name: value for name, value in (options or {}).items() if name == "state"})
         self.agents = list(self.possible_agents)
         return self._observe(data), {name: {} for name in self.agents}

@@ -136,15 +136,15 @@ def test_flocks_start_at_rest_apart_in_a_ball_that_grows_with_the_flock() -> Non
 
 def test_one_seed_fixes_a_rollout_bit_for_bit() -> None:
     state = torch.get_rng_state()
-    flights = [
+    rollouts = [
         FlockingEnv(3, 4, seed=seed, max_steps=7).rollout(20, constant_policy(1.0), break_when_any_done=False)
         for seed in (5, 5, 6)
     ]
-    assert equal(flights[0], flights[1])
-    assert not equal(flights[0], flights[2])
+    assert equal(rollouts[0], rollouts[1])
+    assert not equal(rollouts[0], rollouts[2])
     env = FlockingEnv(3, 4, max_steps=7)
     env.set_seed(5)
-    assert equal(env.rollout(20, constant_policy(1.0), break_when_any_done=False), flights[0])
+    assert equal(env.rollout(20, constant_policy(1.0), break_when_any_done=False), rollouts[0])
     assert torch.equal(torch.get_rng_state(), state)
 
 
@@ -154,15 +154,15 @@ def test_without_a_seed_flights_differ() -> None:
 
 
 def test_starts_and_leader_do_not_depend_on_the_policy() -> None:
-    flights = [
+    rollouts = [
         FlockingEnv(3, 4, seed=1, max_steps=9).rollout(24, constant_policy(value), break_when_any_done=False)
         for value in (0.0, 1.0, 50.0)
     ]
-    start, leader = (flights[0]["agents", "observation"][:, step] for step in (0, slice(None)))
-    for flight in flights[1:]:
-        observation = flight["agents", "observation"]
+    start, leader = (rollouts[0]["agents", "observation"][:, step] for step in (0, slice(None)))
+    for rollout in rollouts[1:]:
+        observation = rollout["agents", "observation"]
         assert torch.equal(observation[:, 0], start)
-        assert torch.equal(observation[:, 9], flights[0]["agents", "observation"][:, 9])  # a fresh episode
+        assert torch.equal(observation[:, 9], rollouts[0]["agents", "observation"][:, 9])  # a fresh episode
         assert torch.equal(observation[..., 0, :], leader[..., 0, :])
         assert not torch.equal(observation[..., 1, :], leader[..., 1, :])
 
@@ -311,7 +311,7 @@ def test_episodes_are_truncated_after_max_steps_and_restart() -> None:
     now, after = rollout["agents", "observation"], rollout["next", "agents", "observation"]
     for step in range(12):
         assert torch.equal(after[:, step], now[:, step + 1]) is not ends[step]
-    # The final observation belongs to the flight that ends: 5 steps of motion, not a fresh start at rest.
+    # The final observation belongs to the rollout that ends: 5 steps of motion, not a fresh start at rest.
     assert now[:, (0, 5, 10), :, 3:].count_nonzero() == 0
     assert after[:, (4, 9), 1:, 3:].abs().amin() > 1e-4
     assert float((after[:, 4, :, :3] - now[:, 4, :, :3]).abs().max()) < 0.05
@@ -441,17 +441,17 @@ def test_what_is_worth_it_is_compiled(how: str, monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.slow  # half a minute of compiling
 @pytest.mark.parametrize("settings", [{}, {"wind": 1.0, "drag": 1.0, "motor_lag": 0.05, "range_spread": 0.3}])
 def test_compiled_flights_are_those_of_eager_ones(settings: dict[str, Any]) -> None:
-    flights = []
+    rollouts = []
     for is_compiled in (False, True):
         config = FlockingConfig(compile=is_compiled, **settings)
         env = FlockingEnv(3, 5, seed=0, config=config, dtype=torch.float64)
-        flights.append(env.rollout(60, Reynolds.for_env(config, action=ACTION), break_when_any_done=False))
+        rollouts.append(env.rollout(60, Reynolds.for_env(config, action=ACTION), break_when_any_done=False))
     for key in (("next", "agents", "observation"), ("next", "agents", "reward")):
-        torch.testing.assert_close(flights[0][key], flights[1][key], rtol=0, atol=1e-9)
-    assert torch.equal(flights[0]["next", "adjacency"], flights[1]["next", "adjacency"])
+        torch.testing.assert_close(rollouts[0][key], rollouts[1][key], rtol=0, atol=1e-9)
+    assert torch.equal(rollouts[0]["next", "adjacency"], rollouts[1]["next", "adjacency"])
 
 
-# Links
+# EdgeList
 
 
 @pytest.mark.parametrize("settings", [{}, {"range_spread": 0.4}, {"num_agents": [4, 20]}])
@@ -480,12 +480,12 @@ def test_too_many_links_are_refused_by_name() -> None:
     ids=["policy", "local expert", "local expert, two hops"],
 )
 def test_lists_of_links_are_flown_by_as_the_matrix_is(policy: Any) -> None:
-    flights = []
+    rollouts = []
     for graph in ("matrix", "links"):
         env = TransformedEnv(FlockingEnv(2, 12, seed=0, graph=graph), InitTracker())
         env.append_transform(policy.make_tensordict_primer())
-        flights.append(env.rollout(5, policy)[ACTION])
-    torch.testing.assert_close(flights[0], flights[1])
+        rollouts.append(env.rollout(5, policy)[ACTION])
+    torch.testing.assert_close(rollouts[0], rollouts[1])
 
 
 @pytest.mark.parametrize("graph", ["matrix", "links"])
@@ -505,7 +505,7 @@ def test_flights_begin_at_given_states() -> None:
     td = env.reset(TensorDict({"agents": {"state": state}}, [3]), set_state=True)
     assert torch.equal(td["agents", "observation"], state)
     flown = env.rollout(5, constant_policy(1.0))[:, -1]["next"]
-    again = FlockingEnv(3, 4, seed=9).reset(flown.clone(), set_state=True)  # where another flight ended
+    again = FlockingEnv(3, 4, seed=9).reset(flown.clone(), set_state=True)  # where another rollout ended
     assert torch.equal(again["agents", "observation"], flown["agents", "observation"])
     assert not torch.equal(env.reset(flown.clone())["agents", "observation"], flown["agents", "observation"])
 
@@ -566,7 +566,7 @@ def test_specs_hold_for_flocks_of_different_size(graph: str) -> None:
 
 
 def test_padding_touches_nothing() -> None:
-    """Rewards, the end of a flight and the expert's labels are those of the flock without padding."""
+    """Rewards, the end of a rollout and the expert's labels are those of the flock without padding."""
     mixed, small = FlockingEnv(2, [3, 6], seed=0, leader_noise=0.0), FlockingEnv(1, 3, seed=0, leader_noise=0.0)
     td, expert = mixed.reset(), Reynolds(action=("agents", "action"))
     state = td["agents", "observation"][:1, :3]

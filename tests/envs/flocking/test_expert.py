@@ -137,8 +137,8 @@ def test_the_module_is_the_function_with_the_gains_of_the_world() -> None:
     position, velocity = flock(0, 2, 4)
     observation = torch.cat((position, velocity), -1)
     data = TensorDict({"agents": {"observation": observation}}, [2])
-    world = FlockingConfig(cohesion_gain=0.1, separation_gain=0.2, alignment_gain=0.3, max_speed=0.5)
-    expert = Reynolds.for_env(world, action="u")
+    env_config = FlockingConfig(cohesion_gain=0.1, separation_gain=0.2, alignment_gain=0.3, max_speed=0.5)
+    expert = Reynolds.for_env(env_config, action="u")
     assert expert.in_keys == [("agents", "observation"), ("agents", "mask")]
     assert expert.out_keys == ["u"]
     expected = reynolds(position, velocity, cohesion=0.1, separation=0.2, alignment=0.3, max_speed=0.5)

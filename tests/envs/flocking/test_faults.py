@@ -28,8 +28,10 @@ ALL = {name: value for fault in FAULTS.values() for name, value in fault.items()
 STATE = ("agents", "state")
 
 
-def fly(steps: int = 30, *, num_envs: int = 3, num_agents: int = 6, seed: int = 0, **settings: Any) -> TensorDictBase:
-    """A flight of the expert."""
+def rollout(
+    steps: int = 30, *, num_envs: int = 3, num_agents: int = 6, seed: int = 0, **settings: Any
+) -> TensorDictBase:
+    """A rollout of the expert."""
     env = FlockingEnv(num_envs, num_agents, seed=seed, **settings)
     expert = Reynolds.for_env(env.config, action=("agents", "action"))
     return env.rollout(steps, expert, break_when_any_done=False)
@@ -49,7 +51,7 @@ def test_specs_hold(settings: dict[str, Any], graph: str) -> None:
 
 @pytest.mark.parametrize("settings", [*FAULTS.values(), ALL], ids=[*FAULTS, "all"])
 def test_one_seed_fixes_them(settings: dict[str, Any]) -> None:
-    first, second, other = (fly(seed=seed, **settings) for seed in (1, 1, 2))
+    first, second, other = (rollout(seed=seed, **settings) for seed in (1, 1, 2))
     assert bool((first == second).all())
     assert not torch.equal(first["agents", "observation"], other["agents", "observation"])
 
@@ -81,8 +83,8 @@ def test_policies_fly_unchanged(settings: dict[str, Any], model: str) -> None:
     env = TransformedEnv(FlockingEnv(2, 5, seed=0, **settings), InitTracker())
     policy = make_model(model, seed=0)
     env.append_transform(policy.make_tensordict_primer())
-    flights = env.rollout(30, policy, break_when_any_done=False)
-    assert bool(flights["agents", "action"].isfinite().all())
+    rollouts = env.rollout(30, policy, break_when_any_done=False)
+    assert bool(rollouts["agents", "action"].isfinite().all())
 
 
 # Messages
@@ -101,31 +103,31 @@ def test_lost_messages_are_as_many_as_asked_for_and_of_either_direction() -> Non
 
 @pytest.mark.parametrize("delay", [1, 4])
 def test_late_observations_are_those_of_some_steps_ago(delay: int) -> None:
-    flights = fly(20, delay=delay)
-    seen, state = flights["agents", "observation"], flights[STATE]
+    rollouts = rollout(20, delay=delay)
+    seen, state = rollouts["agents", "observation"], rollouts[STATE]
     assert torch.equal(seen[:, delay:], state[:, :-delay])
     assert torch.equal(seen[:, :delay], state[:, :1].expand_as(seen[:, :delay]))
-    assert torch.equal(flights["next", "agents", "observation"][:, :-1], seen[:, 1:])
+    assert torch.equal(rollouts["next", "agents", "observation"][:, :-1], seen[:, 1:])
 
 
 def test_delay_begins_anew_with_each_flight() -> None:
     env = FlockingEnv(2, 3, seed=0, delay=2, max_steps=5)
-    flights = env.rollout(12, break_when_any_done=False)
+    rollouts = env.rollout(12, break_when_any_done=False)
     for start in (0, 5, 10):
-        assert torch.equal(flights["agents", "observation"][:, start], flights[STATE][:, start])
+        assert torch.equal(rollouts["agents", "observation"][:, start], rollouts[STATE][:, start])
 
 
 def test_ranges_belong_to_senders_and_stay_for_a_flight() -> None:
     env = FlockingEnv(20, 12, seed=0, range_spread=0.5, max_steps=10)
-    flights = env.rollout(10)
+    rollouts = env.rollout(10)
     reach = env.faults.reach
     assert reach is not None
     assert 0.5 * 3.5 <= float(reach.min()) < 2.0 < 5.0 < float(reach.max()) <= 1.5 * 3.5
-    position = flights["agents", "observation"][..., :3]
+    position = rollouts["agents", "observation"][..., :3]
     distance = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist")
     expected = (distance <= reach[:, None, None, :]) & ~torch.eye(12, dtype=torch.bool)
-    assert torch.equal(flights["adjacency"], expected)
-    assert not torch.equal(flights["adjacency"], flights["adjacency"].mT)
+    assert torch.equal(rollouts["adjacency"], expected)
+    assert not torch.equal(rollouts["adjacency"], rollouts["adjacency"].mT)
     env.reset()
     assert env.faults.reach is not None
     assert not torch.equal(env.faults.reach, reach)
@@ -135,8 +137,8 @@ def test_ranges_belong_to_senders_and_stay_for_a_flight() -> None:
 
 
 def test_noise_is_white_and_of_the_size_asked_for() -> None:
-    flights = fly(50, num_envs=10, num_agents=8, position_noise=0.2, velocity_noise=0.03)
-    error = flights["agents", "observation"] - flights[STATE]
+    rollouts = rollout(50, num_envs=10, num_agents=8, position_noise=0.2, velocity_noise=0.03)
+    error = rollouts["agents", "observation"] - rollouts[STATE]
     assert float(error[..., :3].std()) == pytest.approx(0.2, rel=0.03)
     assert float(error[..., 3:].std()) == pytest.approx(0.03, rel=0.03)
     assert abs(float((error[:, 1:] * error[:, :-1]).mean() / error.square().mean())) < 0.03
@@ -193,12 +195,12 @@ def test_what_dropped_out_reaches_nobody() -> None:
     env = TransformedEnv(FlockingEnv(2, 6, seed=0, dropout_rate=1.0, dropout_time=0.3), InitTracker())
     policy = make_model("modgnn_mlp", hops=2, seed=0)
     env.append_transform(policy.make_tensordict_primer())
-    flights = env.rollout(40, policy, break_when_any_done=False)
-    mask = flights["agents", "mask"]
+    rollouts = env.rollout(40, policy, break_when_any_done=False)
+    mask = rollouts["agents", "mask"]
     assert bool((~mask).any())
-    poisoned = flights.clone()
+    poisoned = rollouts.clone()
     poisoned["agents", "observation"][~mask] = math.nan
-    actions = [policy(td.exclude(("agents", "action")))["agents", "action"] for td in (flights, poisoned)]
+    actions = [policy(td.exclude(("agents", "action")))["agents", "action"] for td in (rollouts, poisoned)]
     assert torch.equal(actions[0][mask], actions[1][mask])
 
 
@@ -220,7 +222,7 @@ def test_gusts_have_the_strength_and_the_memory_asked_for() -> None:
 
 
 def test_wind_pushes_a_whole_flock() -> None:
-    still, windy = (fly(30, num_envs=2, num_agents=5, wind=strength) for strength in (0.0, 1.0))
+    still, windy = (rollout(30, num_envs=2, num_agents=5, wind=strength) for strength in (0.0, 1.0))
     moved = (windy["agents", "observation"] - still["agents", "observation"])[:, -1, :, :3]
     assert float(moved.norm(dim=-1).min()) > 0.01
     # The expert answers to shapes alone, which a push of all does not change; only the leader differs a little.

@@ -1,4 +1,4 @@
-"""Leaders: what each kind promises of its flight."""
+"""Leaders: what each kind promises of its rollout."""
 
 from __future__ import annotations
 

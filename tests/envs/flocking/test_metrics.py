@@ -27,7 +27,7 @@ def all_distances(position: Tensor) -> dict[str, Tensor]:
         "leader_distance": metrics.leader_distance(position),
         "cohesion": metrics.cohesion(position),
         "separation": metrics.separation(position),
-        "smallest_distance": metrics.smallest_distance(position),
+        "min_distance": metrics.min_distance(position),
     }
 
 
@@ -62,11 +62,11 @@ def test_closed_form_line() -> None:
     assert float(metrics.leader_distance(position, 3)) == pytest.approx(8 - 4 / 3)
     assert float(metrics.cohesion(position)) == pytest.approx(8.0)
     assert metrics.separation(position).tolist() == [1.0, 1.0, 2.0, 5.0]
-    assert float(metrics.smallest_distance(position)) == 1.0
-    assert [int(metrics.near_collisions(position, d)) for d in (1.0, 1.5, 2.5, 3.0, 3.5, 100.0)] == [0, 1, 2, 2, 3, 6]
+    assert float(metrics.min_distance(position)) == 1.0
+    assert [int(metrics.collision_rate(position, d)) for d in (1.0, 1.5, 2.5, 3.0, 3.5, 100.0)] == [0, 1, 2, 2, 3, 6]
     assert [bool(metrics.is_diverged(position, d)) for d in (4.9, 5.0)] == [True, False]
-    assert [bool(metrics.is_lost(position, r)) for r in (0.9, 1.0)] == [True, False]
-    assert [bool(metrics.is_lost(position, r, leader=3)) for r in (4.9, 5.0)] == [True, False]
+    assert [bool(metrics.leader_lost(position, r)) for r in (0.9, 1.0)] == [True, False]
+    assert [bool(metrics.leader_lost(position, r, leader=3)) for r in (4.9, 5.0)] == [True, False]
 
 
 @pytest.mark.parametrize("budget", [1, 40, 700, 10**6])
@@ -76,7 +76,7 @@ def test_pairs_match_loops_whatever_the_blocks(
 ) -> None:
     monkeypatch.setitem(tensors.PAIRS_IN_BLOCK, "cpu", budget)
     position = random_flocks(2, 3, 9).to(dtype)
-    separation, count = metrics.separation(position), metrics.near_collisions(position, 1.0)
+    separation, count = metrics.separation(position), metrics.collision_rate(position, 1.0)
     assert separation.dtype == dtype
     assert separation.shape == (2, 3, 9)
     assert count.shape == (2, 3)
@@ -86,19 +86,19 @@ def test_pairs_match_loops_whatever_the_blocks(
             gaps = [[math.dist(p, q) if p is not q else INF for q in points] for p in points]
             assert separation[b, t].tolist() == pytest.approx([min(row) for row in gaps], rel=1e-5)
             assert int(count[b, t]) == sum(gaps[i][j] < 1.0 for i in range(9) for j in range(i))
-    assert torch.equal(metrics.smallest_distance(position), separation.amin(-1))
+    assert torch.equal(metrics.min_distance(position), separation.amin(-1))
 
 
 def test_close_pairs_far_from_the_origin_keep_their_distance() -> None:
     position = torch.tensor([[4096.0, 4096.0, 0], [4096.0, 4096.0, 0.01], [0, 0, 0]])
-    assert float(metrics.smallest_distance(position)) == pytest.approx(0.01, rel=1e-6)
+    assert float(metrics.min_distance(position)) == pytest.approx(0.01, rel=1e-6)
 
 
 def test_identical_agents() -> None:
     position = torch.ones(4, 3)
     assert metrics.separation(position).tolist() == [0.0] * 4
-    assert int(metrics.near_collisions(position, 0.1)) == 6
-    assert int(metrics.near_collisions(position, 0.0)) == 0
+    assert int(metrics.collision_rate(position, 0.1)) == 6
+    assert int(metrics.collision_rate(position, 0.0)) == 0
 
 
 @settings(max_examples=25, deadline=None)
@@ -115,9 +115,9 @@ def test_distances_follow_similarity_transforms(n: int, seed: int, scale: float,
     expected = all_distances(position)
     for name, value in all_distances(moved).items():
         assert torch.allclose(value, scale * expected[name], rtol=1e-9, atol=1e-11), name
-    assert (metrics.near_collisions(moved, scale) == metrics.near_collisions(position, 1.0)).all()
+    assert (metrics.collision_rate(moved, scale) == metrics.collision_rate(position, 1.0)).all()
     assert (metrics.is_diverged(moved, 2 * scale) == metrics.is_diverged(position, 2.0)).all()
-    assert (metrics.is_lost(moved, scale) == metrics.is_lost(position, 1.0)).all()
+    assert (metrics.leader_lost(moved, scale) == metrics.leader_lost(position, 1.0)).all()
 
 
 def test_numbering_of_the_followers_does_not_matter() -> None:
@@ -133,7 +133,7 @@ def test_numbering_of_the_followers_does_not_matter() -> None:
     leader = int(torch.argsort(torch.randperm(10, generator=torch.Generator().manual_seed(3)))[0])
     swapped = position.roll(leader, dims=1)
     assert torch.allclose(metrics.leader_distance(swapped, leader), expected["leader_distance"])
-    assert torch.equal(metrics.is_lost(swapped, 1.0, leader), metrics.is_lost(position, 1.0))
+    assert torch.equal(metrics.leader_lost(swapped, 1.0, leader), metrics.leader_lost(position, 1.0))
 
 
 def test_bounds_between_metrics() -> None:
@@ -149,10 +149,10 @@ def test_one_agent() -> None:
     assert metrics.leader_distance(position).tolist() == [0.0]
     assert metrics.cohesion(position).tolist() == [0.0]
     assert metrics.separation(position).isnan().tolist() == [[True]]
-    assert metrics.smallest_distance(position).isnan().tolist() == [True]
-    assert metrics.near_collisions(position, 1.0).tolist() == [0]
+    assert metrics.min_distance(position).isnan().tolist() == [True]
+    assert metrics.collision_rate(position, 1.0).tolist() == [0]
     assert metrics.is_diverged(position, 1.0).tolist() == [False]
-    assert metrics.is_lost(position, 1.0).tolist() == [False]
+    assert metrics.leader_lost(position, 1.0).tolist() == [False]
 
 
 def test_two_agents() -> None:
@@ -160,7 +160,7 @@ def test_two_agents() -> None:
     assert float(metrics.leader_distance(position)) == 5.0
     assert float(metrics.cohesion(position)) == pytest.approx(5.0)
     assert metrics.separation(position).tolist() == [5.0, 5.0]
-    assert int(metrics.near_collisions(position, 5.5)) == 1
+    assert int(metrics.collision_rate(position, 5.5)) == 1
 
 
 @pytest.mark.parametrize("bad", [NAN, INF, -INF])
@@ -170,9 +170,9 @@ def test_not_finite_flocks_are_diverged(bad: float) -> None:
     assert metrics.is_diverged(position, 10.0).tolist() == [False, True]
     assert metrics.is_diverged(position, INF).tolist() == [False, True]
     assert metrics.cohesion(position).isnan().tolist() == [False, True]
-    assert metrics.near_collisions(position, 1.0).tolist() == [6, 3]
-    assert metrics.is_lost(position, 1.0).tolist() == [False, False]
-    assert metrics.is_lost(position, 1.0, leader=2).tolist() == [False, True]
+    assert metrics.collision_rate(position, 1.0).tolist() == [6, 3]
+    assert metrics.leader_lost(position, 1.0).tolist() == [False, False]
+    assert metrics.leader_lost(position, 1.0, leader=2).tolist() == [False, True]
 
 
 def test_agents_that_do_not_exist_make_no_flock_diverge() -> None:
@@ -194,7 +194,7 @@ def test_nan_agent_shows_in_the_separation_of_its_flock_only() -> None:
     assert metrics.separation(position).isnan().tolist() == [[False] * 4, [True] * 4]
 
 
-@pytest.mark.parametrize("function", [metrics.leader_distance, lambda p, leader: metrics.is_lost(p, 1.0, leader)])
+@pytest.mark.parametrize("function", [metrics.leader_distance, lambda p, leader: metrics.leader_lost(p, 1.0, leader)])
 @pytest.mark.parametrize("leader", [-1, 4])
 def test_unknown_leader_is_refused(function: Callable[..., object], leader: int) -> None:
     with pytest.raises(InputError, match="not an agent"):
@@ -204,5 +204,5 @@ def test_unknown_leader_is_refused(function: Callable[..., object], leader: int)
 def test_empty_batch() -> None:
     position = torch.zeros(0, 4, 3)
     assert metrics.separation(position).shape == (0, 4)
-    assert metrics.near_collisions(position, 1.0).shape == (0,)
+    assert metrics.collision_rate(position, 1.0).shape == (0,)
     assert metrics.cohesion(position).shape == (0,)

@@ -1,4 +1,4 @@
-"""States and actions that are no numbers any more: named, and either the end or the loss of one flock's flight."""
+"""States and actions that are no numbers any more: named, and either the end or the loss of one flock's rollout."""
 
 from __future__ import annotations
 
@@ -63,16 +63,16 @@ SABOTEURS = {
 }
 
 
-def fly(env: FlockingEnv, steps: int, sabotage: Saboteur | None = None) -> list[TensorDictBase]:
+def rollout(env: FlockingEnv, steps: int, sabotage: Saboteur | None = None) -> list[TensorDictBase]:
     """The expert's transitions, one of them spoiled."""
-    td, flight = env.reset(), []
+    td, rollout = env.reset(), []
     for step in range(steps):
         td = EXPERT(td)
         if sabotage is not None and step == STEP:
             sabotage(env, td["agents", "action"])
         transition, td = env.step_and_maybe_reset(td)
-        flight.append(transition)
-    return flight
+        rollout.append(transition)
+    return rollout
 
 
 def is_finite(td: TensorDictBase) -> bool:
@@ -85,7 +85,7 @@ def test_flights_stop_with_one_sentence(name: str) -> None:
     wrong = "too large to compute with" if "huge" in name else "not finite"
     message = rf"the {kind} of agent 2 in flock 1 at step 3 is {wrong} \(\[.*env\.on_nonfinite=restart"
     with pytest.raises(NotFinite, match=message):
-        fly(FlockingEnv(3, 4, seed=0), 5, SABOTEURS[name])
+        rollout(FlockingEnv(3, 4, seed=0), 5, SABOTEURS[name])
     assert issubclass(NotFinite, InputError)  # so that commands report it in one line
 
 
@@ -106,16 +106,16 @@ def test_only_the_lost_flock_begins_anew(settings: dict[str, Any], name: str) ->
     env, twin = (FlockingEnv(3, seed=0, **settings) for _ in range(2))
     others = [flock for flock in range(3) if flock != FLOCK]
     with pytest.warns(RuntimeWarning, match=r"of agent 2 in flock 1 at step 3 is .*that flock begins anew") as record:
-        flight = fly(env, 8, SABOTEURS[name])
-    expected = fly(twin, 8)
+        found = rollout(env, 8, SABOTEURS[name])
+    expected = rollout(twin, 8)
     assert len(record) == 1
-    assert all(torch.equal(flight[STEP][key][FLOCK], expected[STEP][key][FLOCK]) for key in ("done", "adjacency"))
+    assert all(torch.equal(found[STEP][key][FLOCK], expected[STEP][key][FLOCK]) for key in ("done", "adjacency"))
 
-    lost, key = flight[STEP][FLOCK], env.config.state_key
-    assert is_finite(flight[STEP]["next"])
+    lost, key = found[STEP][FLOCK], env.config.state_key
+    assert is_finite(found[STEP]["next"])
     assert torch.equal(lost["next"][key], lost[key])
     assert [bool(lost["next", flag]) for flag in ("terminated", "truncated", "done")] == [True, False, True]
-    fresh = flight[STEP + 1][FLOCK]
+    fresh = found[STEP + 1][FLOCK]
     assert not fresh[key][:, 3:].any()
     assert not torch.equal(fresh[key], lost[key])
     assert env.step_count.flatten().tolist() == [8, 4, 8]
@@ -124,7 +124,7 @@ def test_only_the_lost_flock_begins_anew(settings: dict[str, Any], name: str) ->
     for step in range(STEP + 1 if "delay" in settings else 8):
         theirs = expected[step][others].exclude(("agents", "action"))
         for entry, value in theirs.items(True, True):
-            assert torch.equal(flight[step][others][entry], value), (step, entry)
+            assert torch.equal(found[step][others][entry], value), (step, entry)
 
 
 @pytest.mark.parametrize("settings", [{"linear_damping": 1e6}, {"linear_damping": 1e9}, {"leader_noise": INF}], ids=str)
@@ -133,11 +133,11 @@ def test_flights_that_cannot_be_integrated_survive(settings: dict[str, float]) -
     env = FlockingEnv(3, 4, config=FlockingConfig(on_nonfinite="restart", **settings), seed=0)  # type: ignore[arg-type]
     with warnings.catch_warnings(record=True) as record:
         warnings.simplefilter("always")
-        flight = fly(env, 12)
+        steps = rollout(env, 12)
     assert len(record) == 12
-    assert all(is_finite(transition) for transition in flight)
+    assert all(is_finite(transition) for transition in steps)
     with pytest.raises(NotFinite, match=r"lower gains and dampings or raise env\.physics_substeps"):
-        fly(FlockingEnv(3, 4, config=FlockingConfig(**settings), seed=0), 12)  # type: ignore[arg-type]
+        rollout(FlockingEnv(3, 4, config=FlockingConfig(**settings), seed=0), 12)  # type: ignore[arg-type]
 
 
 def test_several_lost_flocks_are_one_line() -> None:

@@ -1,4 +1,4 @@
-"""Flights that are interrupted go on bit for bit: all physics, leaders, faults and sizes."""
+"""Rollouts that are interrupted go on bit for bit: all physics, leaders, faults and sizes."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ WORLDS: dict[str, dict[str, Any]] = {
 
 
 def make(seed: int = 0, num_envs: int = 3, **settings: Any) -> FlockingEnv:
-    """Flocks whose flights end now and then."""
+    """FlockBuffer whose rollouts end now and then."""
     return FlockingEnv(num_envs, seed=seed, stagger=True, **{"num_agents": 5, "max_steps": 9, **settings})
 
 
-def fly(env: FlockingEnv, td: TensorDictBase, steps: int) -> tuple[list[TensorDictBase], TensorDictBase]:
+def rollout(env: FlockingEnv, td: TensorDictBase, steps: int) -> tuple[list[TensorDictBase], TensorDictBase]:
     """The expert's transitions, and the tensordict that is carried on."""
-    flight = []
+    rollout = []
     for _ in range(steps):
         transition, td = env.step_and_maybe_reset(EXPERT(td.clone()))
-        flight.append(transition)
-    return flight, td
+        rollout.append(transition)
+    return rollout, td
 
 
 def generators(env: FlockingEnv) -> list[Tensor]:
@@ -59,9 +59,9 @@ def resume(env: FlockingEnv, snapshot: dict[str, Tensor], states: list[Tensor]) 
     env.faults.generator.set_state(states[1])
 
 
-def assert_equal(flight: list[TensorDictBase], other: list[TensorDictBase]) -> None:
+def assert_equal(rollout: list[TensorDictBase], other: list[TensorDictBase]) -> None:
     """Equal bit for bit."""
-    for step, (one, two) in enumerate(zip(flight, other, strict=True)):
+    for step, (one, two) in enumerate(zip(rollout, other, strict=True)):
         assert set(one.keys(True, True)) == set(two.keys(True, True))
         for key, value in one.items(True, True):
             assert torch.equal(value, two[key]), (step, key)
@@ -72,13 +72,13 @@ def test_flights_go_on_bit_for_bit(name: str) -> None:
     """In an environment with another seed that was never reset, and in one that has flown elsewhere meanwhile."""
     settings = WORLDS.get(name, {"compile": True, "motor_lag": 0.05})
     env = make(**settings)
-    _, td = fly(env, env.reset(), 11)
+    _, td = rollout(env, env.reset(), 11)
     stored, states, carried = save(env.snapshot()), generators(env), td.clone()
-    expected, _ = fly(env, td, 16)
+    expected, _ = rollout(env, td, 16)
     fresh = make(seed=1, **settings)
     for other in (fresh, env):
         resume(other, load(stored), states)
-        assert_equal(fly(other, carried.clone(), 16)[0], expected)
+        assert_equal(rollout(other, carried.clone(), 16)[0], expected)
     # They were in the middle of something, and all have begun anew since.
     assert torch.stack([td["next", "done"] for td in expected]).any(0).all()
 
@@ -86,7 +86,7 @@ def test_flights_go_on_bit_for_bit(name: str) -> None:
 def test_agents_that_touch_go_on_up_to_rounding_in_bullet() -> None:
     """A heap that is pushed together: a snapshot holds nothing of what Bullet remembers of contacts.
 
-    So a flight that goes on from it is not the old one to the last bit, but the same in whichever engine.
+    So a rollout that goes on from it is not the old one to the last bit, but the same in whichever engine.
     """
     engine, one, other = (BulletPhysics(1, 6, collisions=True, dtype=torch.float64) for _ in range(3))
     generator = torch.Generator().manual_seed(0)
@@ -108,17 +108,17 @@ def test_agents_that_touch_go_on_up_to_rounding_in_bullet() -> None:
 
 
 def test_a_snapshot_stands_apart() -> None:
-    """Neither flights change a snapshot, nor the other way round, before and after it is restored."""
+    """Neither rollouts change a snapshot, nor the other way round, before and after it is restored."""
     env, twin = (make(seed=2, **OUTDOORS) for _ in range(2))
-    _, td = fly(env, env.reset(), 5)
+    _, td = rollout(env, env.reset(), 5)
     snapshot, states = env.snapshot(), generators(env)
     kept = {name: value.clone() for name, value in snapshot.items()}
     resume(twin, snapshot, states)
-    expected, _ = fly(env, td, 5)
+    expected, _ = rollout(env, td, 5)
     assert all(torch.equal(value, kept[name]) for name, value in snapshot.items())
     for value in snapshot.values():
         value.fill_(1)
-    assert_equal(fly(twin, td, 5)[0], expected)
+    assert_equal(rollout(twin, td, 5)[0], expected)
 
 
 def test_names() -> None:
@@ -161,13 +161,13 @@ def test_snapshots_of_another_world_are_refused(settings: dict[str, Any], messag
 @pytest.mark.parametrize("name", ["plain", "outdoors", "lost links", "bullet"])
 def test_snapshots_restore_on_another_device(name: str) -> None:
     env = make(device="cuda", **WORLDS[name])
-    _, td = fly(env, env.reset(), 11)
+    _, td = rollout(env, env.reset(), 11)
     snapshot = {key: value.cpu() for key, value in env.snapshot().items()}
     states, carried = generators(env), td.clone()
-    expected, _ = fly(env, td, 16)
+    expected, _ = rollout(env, td, 16)
     other = make(seed=1, device="cuda", **WORLDS[name])
     resume(other, snapshot, states)
-    assert_equal(fly(other, carried, 16)[0], expected)
+    assert_equal(rollout(other, carried, 16)[0], expected)
     on_cpu = make(seed=1, **WORLDS[name])
     on_cpu.restore(env.snapshot())
     assert torch.equal(on_cpu.physics.position, env.physics.position.cpu())

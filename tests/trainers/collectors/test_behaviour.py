@@ -9,11 +9,11 @@ import torch
 from tensordict import TensorDict
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.collectors.behaviour import Mixture, expert_share
+from modgnn_rl.trainers.collectors.behaviour import BetaMixture, beta_schedule
 
 
 def _share(schedule, index):
-    return expert_share(schedule, index, start=0.8, decay=0.5, last_round=10)
+    return beta_schedule(schedule, index, start=0.8, decay=0.5, last_round=10)
 
 
 def test_schedules_have_their_closed_forms():
@@ -35,10 +35,10 @@ def _fly(mixture, flocks, agents=3):
 
 
 def test_one_flies_all_agents_of_a_flock_for_a_stretch():
-    mixture = Mixture(0.5, 4, torch.Generator().manual_seed(0))
-    flights = torch.stack([_fly(mixture, 200)["agents", "action"] for _ in range(8)])
-    assert (flights == flights[:, :, :1, :1]).all()
-    flown = flights[:, :, 0, 0]
+    mixture = BetaMixture(0.5, 4, torch.Generator().manual_seed(0))
+    rollouts = torch.stack([_fly(mixture, 200)["agents", "action"] for _ in range(8)])
+    assert (rollouts == rollouts[:, :, :1, :1]).all()
+    flown = rollouts[:, :, 0, 0]
     assert (flown[:4] == flown[0]).all()
     assert (flown[4:] == flown[4]).all()
     assert (flown[0] != flown[4]).any()
@@ -46,18 +46,18 @@ def test_one_flies_all_agents_of_a_flock_for_a_stretch():
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
 def test_the_share_is_the_share_of_flocks(share):
-    mixture = Mixture(share, 1, torch.Generator().manual_seed(0))
+    mixture = BetaMixture(share, 1, torch.Generator().manual_seed(0))
     mixed = _fly(mixture, 4000)
     assert mixed["expert_flies"].float().mean() == pytest.approx(share, abs=0.03)
     assert (mixed["agents", "action"][..., 0, 0].bool() == mixed["expert_flies"].squeeze(-1)).all()
 
 
 def test_a_new_share_holds_from_the_next_toss_on():
-    mixture = Mixture(1.0, 3, torch.Generator().manual_seed(0))
+    mixture = BetaMixture(1.0, 3, torch.Generator().manual_seed(0))
     flown = []
     for _ in range(6):
         flown.append(bool(_fly(mixture, 10)["expert_flies"].all()))
-        mixture.share = 0.0
+        mixture.beta = 0.0
     assert flown == [True] * 3 + [False] * 3
 
 

@@ -1,4 +1,4 @@
-"""Flights for training: continued, labelled, cut into windows."""
+"""Rollouts for training: continued, labelled, cut into windows."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from torch import nn
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds, reynolds
-from modgnn_rl.trainers.collectors.flocks import Flocks, flocks_of_all_sizes
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer, make_buffers
 from modgnn_rl.trainers.collectors.windows import as_windows
 
 
-def _flocks(policy, *, seed=0, steps=10, every=2, **world):
-    settings = DAggerConfig(every=every, capacity=1000, batch_size=16)
-    config = FlockingConfig(**world)
-    return Flocks(config, settings, 4, 5, [policy], Reynolds(), steps=steps, stretch=steps, seed=seed)
+def _flocks(policy, *, seed=0, steps=10, stride=2, **env_config):
+    settings = DAggerConfig(stride=stride, capacity=1000, batch_size=16)
+    config = FlockingConfig(**env_config)
+    return FlockBuffer(config, settings, 4, 5, [policy], Reynolds(), steps=steps, hold_steps=steps, seed=seed)
 
 
 def test_windows_end_at_every_so_manyth_step():
-    flights = TensorDict({"step": torch.arange(10).expand(3, 10), "flock": torch.arange(3).unsqueeze(1).expand(3, 10)})
-    windows = as_windows(flights.auto_batch_size_(2), length=3, every=4)
+    rollouts = TensorDict({"step": torch.arange(10).expand(3, 10), "flock": torch.arange(3).unsqueeze(1).expand(3, 10)})
+    windows = as_windows(rollouts.auto_batch_size_(2), length=3, stride=4)
     assert windows["step"].tolist() == [[0, 1, 2], [4, 5, 6]] * 3
     assert (windows["flock"] == windows["flock"][:, :1]).all()
 
@@ -47,10 +47,10 @@ def test_every_state_is_labelled_with_the_expert_of_that_state():
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_who_flies_is_told(share):
-    flights = _flocks(make_model("gcn", seed=0)).fly(share)
-    same = torch.isclose(flights["agents", "action"], flights["agents", "expert_action"]).all(-1).all(-1)
+    rollouts = _flocks(make_model("gcn", seed=0)).fly(share)
+    same = torch.isclose(rollouts["agents", "action"], rollouts["agents", "expert_action"]).all(-1).all(-1)
     assert same.all() if share else not same.any()
-    assert (flights["expert_flies"] == bool(share)).all()
+    assert (rollouts["expert_flies"] == bool(share)).all()
 
 
 def test_new_weights_fly_at_once():
@@ -65,11 +65,11 @@ def test_new_weights_fly_at_once():
 
 def test_one_seed_fixes_the_data():
     first, again, other = (_flocks(make_model("gcn", seed=0), seed=seed) for seed in (1, 1, 2))
-    flights = [flocks.fly(0.5) for flocks in (first, again, other)]
-    for flocks, flown in zip((first, again), flights, strict=False):
+    rollouts = [flocks.fly(0.5) for flocks in (first, again, other)]
+    for flocks, flown in zip((first, again), rollouts, strict=False):
         flocks.keep(flown)
-    assert (flights[0] == flights[1]).all()
-    assert not (flights[0]["agents", "observation"] == flights[2]["agents", "observation"]).all(-1).any()
+    assert (rollouts[0] == rollouts[1]).all()
+    assert not (rollouts[0]["agents", "observation"] == rollouts[2]["agents", "observation"]).all(-1).any()
     assert (first.buffer.sample() == again.buffer.sample()).all()
 
 
@@ -84,6 +84,6 @@ def test_learned_messages_are_kept_as_windows_without_the_stale_ones():
 
 def test_sizes_share_the_agents():
     config = TrainConfig(env=FlockingConfig(num_agents=[4, 8, 32]), trainer=DAggerConfig(num_envs=6))
-    flocks = flocks_of_all_sizes(config, [make_model("gcn", seed=0)], Reynolds(), steps=2, stretch=2)
+    flocks = make_buffers(config, [make_model("gcn", seed=0)], Reynolds(), steps=2, hold_steps=2)
     shapes = [group.fly(0.0)["adjacency"].shape for group in flocks.values()]
     assert shapes == [(16, 2, 4, 4), (8, 2, 8, 8), (2, 2, 32, 32)]

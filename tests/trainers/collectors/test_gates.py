@@ -15,8 +15,8 @@ from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
-from modgnn_rl.trainers.collectors.behaviour import Disturbance, Ensemble, SafetyGate, disagreement, spread
-from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.collectors.behaviour import ActionNoise, Ensemble, SafetyGate, disagreement, ensemble_std
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer
 
 FLOCKS, AGENTS = 6, 4
 
@@ -25,7 +25,7 @@ def _step(seed=0):
     generator = torch.Generator().manual_seed(seed)
     agents = {name: torch.randn(FLOCKS, AGENTS, 3, generator=generator) for name in ("action", "expert_action")}
     agents["controlled"] = (torch.arange(AGENTS) > 0).expand(FLOCKS, -1).clone()
-    agents["spread"] = torch.rand(FLOCKS, AGENTS, generator=generator)
+    agents["ensemble_std"] = torch.rand(FLOCKS, AGENTS, generator=generator)
     return TensorDict({"agents": TensorDict(agents, FLOCKS)}, FLOCKS)
 
 
@@ -43,10 +43,10 @@ def test_disagreement_is_the_root_mean_square_over_those_that_are_flown():
 
 def test_spread_is_the_root_mean_square_over_those_that_are_flown():
     step = _step()
-    torch.testing.assert_close(spread(step), step["agents", "spread"][:, 1:].square().mean(-1).sqrt())
+    torch.testing.assert_close(ensemble_std(step), step["agents", "ensemble_std"][:, 1:].square().mean(-1).sqrt())
 
 
-@pytest.mark.parametrize("measure", [disagreement, spread])
+@pytest.mark.parametrize("measure", [disagreement, ensemble_std])
 def test_the_expert_flies_exactly_where_the_measure_is_above_the_threshold(measure):
     step = _step()
     value = measure(step)
@@ -75,8 +75,8 @@ def test_a_gate_behind_a_mixture_adds_to_what_the_expert_flies():
 
 
 def _flocks(policies, gate, **settings):
-    config = DAggerConfig(every=1, capacity=1000, batch_size=16, **settings)
-    return Flocks(
+    config = DAggerConfig(stride=1, capacity=1000, batch_size=16, **settings)
+    return FlockBuffer(
         FlockingConfig(max_steps=7),
         config,
         FLOCKS,
@@ -84,28 +84,28 @@ def _flocks(policies, gate, **settings):
         policies,
         Reynolds(),
         steps=10,
-        stretch=10,
+        hold_steps=10,
         gate=gate,
         seed=0,
     )
 
 
-@pytest.mark.parametrize("measure", [disagreement, spread])
+@pytest.mark.parametrize("measure", [disagreement, ensemble_std])
 def test_in_flight_messages_go_on_while_the_expert_flies(measure):
     policies = [make_model("pair_force", hidden=8, seed=seed) for seed in range(3)]
     thresholds = {}
     for threshold, share in ((1e-6, 1.0), (1e6, 0.0)):
         flocks = _flocks(policies, SafetyGate(measure, threshold))
-        flights = flocks.fly(0.0)
-        thresholds[share] = flights
+        rollouts = flocks.fly(0.0)
+        thresholds[share] = rollouts
         # At the first step nobody has heard of anybody: all members stand still.
-        flies = flights["expert_flies"]
-        assert (flies | flights["is_init"]).all() if share else not flies.any()
-        same = (flights["agents", "action"] == flights["agents", "expert_action"]).flatten(2).all(-1)
+        flies = rollouts["expert_flies"]
+        assert (flies | rollouts["is_init"]).all() if share else not flies.any()
+        same = (rollouts["agents", "action"] == rollouts["agents", "expert_action"]).flatten(2).all(-1)
         assert torch.equal(same, flies.squeeze(-1))
-        going_on = ~flights["is_init"][:, 1:, 0]
-        sent = flights["agents", "observation"][:, :-1].unsqueeze(-2)
-        assert torch.equal(flights["messages"][:, 1:][going_on], sent[going_on])
+        going_on = ~rollouts["is_init"][:, 1:, 0]
+        sent = rollouts["agents", "observation"][:, :-1].unsqueeze(-2)
+        assert torch.equal(rollouts["messages"][:, 1:][going_on], sent[going_on])
     assert not torch.equal(thresholds[1.0]["agents", "observation"], thresholds[0.0]["agents", "observation"])
 
 
@@ -116,13 +116,13 @@ def test_identical_members_have_no_spread_and_different_ones_have_that_of_the_fo
     steps["adjacency"] = ~torch.eye(AGENTS, dtype=torch.bool).expand(2, -1, -1)
     steps["is_init"] = torch.ones(2, 1, dtype=torch.bool)
     alike = Ensemble([make_model("mpnn", hops=0, hidden=8, seed=3) for _ in range(3)])
-    assert alike(steps.clone())["agents", "spread"].abs().max() < 1e-7
+    assert alike(steps.clone())["agents", "ensemble_std"].abs().max() < 1e-7
     members = [make_model("mpnn", hops=0, hidden=8, seed=seed) for seed in range(3)]
     found = Ensemble(members)(steps.clone())
     actions = torch.stack([member(steps.clone())["agents", "action"] for member in members])
     assert torch.equal(found["agents", "action"], actions[0])
     # The mean over members of the squared distance from their mean: the trace of the biased covariance.
-    torch.testing.assert_close(found["agents", "spread"], actions.var(0, correction=0).sum(-1).sqrt())
+    torch.testing.assert_close(found["agents", "ensemble_std"], actions.var(0, correction=0).sum(-1).sqrt())
 
 
 def _flown(policy, behaviour, steps=6):
@@ -135,7 +135,7 @@ def _flown(policy, behaviour, steps=6):
     ("name", "model"), [("pair_force", {"hops": 2}), ("mpnn", {"hops": 2}), ("mpnn", {"layers": 2})]
 )
 def test_each_member_has_messages_of_its_own(name, model):
-    """Along the ensemble's flights, each acts and remembers as if it were alone there."""
+    """Along the ensemble's rollouts, each acts and remembers as if it were alone there."""
     members = [make_model(name, hidden=8, seed=seed, **model) for seed in range(3)]
     ensemble = Ensemble(members)
     with torch.no_grad():
@@ -143,22 +143,24 @@ def test_each_member_has_messages_of_its_own(name, model):
         assert bool(together["is_init"][:, 1:].any())
         actions = []
         for number, member in enumerate(members):
-            # The same flights: the first member flies, and another one thinks along with messages of its own.
+            # The same rollouts: the first member flies, and another one thinks along with messages of its own.
             alone = _thinking_along(member, together)
             key = "messages" if number == 0 else f"messages_{number}"
-            mine, theirs = (flights.nan_to_num(7.0) for flights in (together["next", key], alone["messages"]))
+            mine, theirs = (rollouts.nan_to_num(7.0) for rollouts in (together["next", key], alone["messages"]))
             torch.testing.assert_close(mine, theirs)
             actions.append(alone["action"])
     torch.testing.assert_close(together["agents", "action"], actions[0])
-    torch.testing.assert_close(together["agents", "spread"], torch.stack(actions).var(0, correction=0).sum(-1).sqrt())
+    torch.testing.assert_close(
+        together["agents", "ensemble_std"], torch.stack(actions).var(0, correction=0).sum(-1).sqrt()
+    )
     if name == "mpnn":
         assert not torch.equal(together["messages"].nan_to_num(7.0), together["messages_1"].nan_to_num(7.0))
 
 
-def _thinking_along(member, flights):
-    """What a policy would do and remember, one step after the other, on flights that another one flew."""
+def _thinking_along(member, rollouts):
+    """What a policy would do and remember, one step after the other, on rollouts that another one flew."""
     messages, actions, sent = None, [], []
-    for step in flights.select(("agents", "observation"), "adjacency", "is_init").unbind(1):
+    for step in rollouts.select(("agents", "observation"), "adjacency", "is_init").unbind(1):
         given = step.clone()
         if messages is not None:
             given["messages"] = messages
@@ -180,7 +182,7 @@ def test_an_ensemble_of_two_flies_through_an_environment_as_its_first_member_alo
 
 def test_a_disturbance_has_the_stated_standard_deviation_and_leaves_labels_alone():
     step = TensorDict({"agents": {"action": torch.zeros(500, 8, 3), "expert_action": torch.ones(500, 8, 3)}}, 500)
-    disturbance = Disturbance(0.2, torch.Generator().manual_seed(0))
+    disturbance = ActionNoise(0.2, torch.Generator().manual_seed(0))
     flown = [disturbance(step.clone())["agents"] for _ in range(2)]
     for agents in flown:
         assert agents["action"].mean().abs() < 0.01
@@ -193,11 +195,11 @@ def test_a_disturbance_has_the_stated_standard_deviation_and_leaves_labels_alone
 
 def test_disturbed_flights_are_labelled_with_the_expert_of_the_states_that_they_meet():
     flocks = _flocks([make_model("pair_force", hidden=8, seed=0)], None)
-    flocks.disturbance.scale = 0.3
-    flights = flocks.fly(1.0)
-    label = Reynolds()(flights.select(("agents", "observation")))["agents", "expert_action"]
-    torch.testing.assert_close(flights["agents", "expert_action"], label)
-    noise = flights["agents", "action"] - flights["agents", "expert_action"]
+    flocks.action_noise.scale = 0.3
+    rollouts = flocks.fly(1.0)
+    label = Reynolds()(rollouts.select(("agents", "observation")))["agents", "expert_action"]
+    torch.testing.assert_close(rollouts["agents", "expert_action"], label)
+    noise = rollouts["agents", "action"] - rollouts["agents", "expert_action"]
     assert noise.std().item() == pytest.approx(0.3, rel=0.1)
 
 
@@ -208,7 +210,7 @@ def _without_evaluation(monkeypatch):
 
 def _run(runs, model, **settings):
     small = {"num_envs": 1, "batch_size": 16, "capacity": 100, "cloning_steps": 6, "cloning_updates": 4}
-    small |= {"rounds": 4, "round_steps": 6, "round_updates": 2, "stretch": 3, "held_out": 1}
+    small |= {"rounds": 4, "steps_per_round": 6, "updates_per_round": 2, "hold_steps": 3, "num_val_envs": 1}
     trainer = DAggerConfig(**{**small, **settings})
     env = FlockingConfig(num_agents=4, max_steps=20)
     return train(TrainConfig(env=env, model=model, trainer=trainer, runs=str(runs), threads=1))
@@ -253,7 +255,7 @@ def test_a_strict_gate_lets_the_expert_fly_and_a_lax_one_does_not(tmp_path):
             ModelConfig(name="pair_force", hidden=8),
             gate="disagreement",
             gate_threshold=threshold,
-            expert_share=0.0,
+            beta=0.0,
         )
         shares.append([line["4/expert_flew"] for line in run.read_metrics()[1:]])
     assert shares == [[1.0] * 4, [0.0] * 4]
@@ -261,6 +263,6 @@ def test_a_strict_gate_lets_the_expert_fly_and_a_lax_one_does_not(tmp_path):
 
 @pytest.mark.usefixtures("_without_evaluation")
 def test_a_run_stops_on_a_plateau(tmp_path):
-    settings = {"plateau_rounds": 1, "plateau_gain": 1.0, "expert_rounds": 1, "expert_share": 0.0}
+    settings = {"plateau_rounds": 1, "plateau_gain": 1.0, "beta_rounds": 1, "beta": 0.0}
     metrics = _run(tmp_path, ModelConfig(name="pair_force", hidden=8), **settings).read_metrics()
     assert [line["step"] for line in metrics] == [0, 1, 2, 3]  # the first that counts is the second

@@ -1,4 +1,4 @@
-"""Flights of worker processes: those of one process, and nothing hangs, is lost or left behind when a worker dies."""
+"""Rollouts of worker processes: those of one process, and nothing hangs, is lost or left behind when a worker dies."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.collectors.behaviour import Disturbance, Ensemble, Mixture
+from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, Ensemble
 from modgnn_rl.trainers.collectors.local import FlockCollector
-from modgnn_rl.trainers.collectors.remote import RemoteFlights, check_collector
+from modgnn_rl.trainers.collectors.remote import RemoteCollector, check_collector
 from modgnn_rl.trainers.collectors.worker import packed
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.utils.seeds import derive_seed
@@ -37,14 +37,14 @@ import os, sys
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.remote import RemoteFlights
+from modgnn_rl.trainers.collectors.remote import RemoteCollector
 if __name__ == "__main__":
     flown = (make_model("gcn", seed=0), Reynolds())
-    flights = RemoteFlights(FlockingConfig(), 2, 3, flown, steps=2, seed=0, collector=CollectorConfig(sys.argv[1], 2))
-    flights.continue_flights()
-    print(*(worker.process for worker in flights._workers), flush=True)
+    rollouts = RemoteCollector(FlockingConfig(), 2, 3, flown, steps=2, seed=0, collector=CollectorConfig(sys.argv[1],
+    2)) rollouts.collect()
+    print(*(worker.process for worker in rollouts._workers), flush=True)
     while sys.argv[2] == "fly":
-        flights.continue_flights()
+        rollouts.collect()
 """
 
 
@@ -52,12 +52,14 @@ def behaviour(seed: int = SEED) -> list[TensorDictModuleBase]:
     """A policy that explores, the expert, and who of them flies."""
     generators = [torch.Generator().manual_seed(derive_seed(seed, name)) for name in ("mixture", "disturbance")]
     actor = GaussianActor(make_model("moment_force", seed=0))
-    return [actor, Reynolds(), Mixture(0.5, 3, generators[0]), Disturbance(0.1, generators[1])]
+    return [actor, Reynolds(), BetaMixture(0.5, 3, generators[0]), ActionNoise(0.1, generators[1])]
 
 
-def remote(name: str = "process", *, timeout: float = 60.0, flown: list[TensorDictModuleBase] | None = None, **world):
-    return RemoteFlights(
-        FlockingConfig(**world),
+def remote(
+    name: str = "process", *, timeout: float = 60.0, flown: list[TensorDictModuleBase] | None = None, **env_config
+):
+    return RemoteCollector(
+        FlockingConfig(**env_config),
         sum(SHARES),
         AGENTS,
         flown or behaviour(),
@@ -67,15 +69,15 @@ def remote(name: str = "process", *, timeout: float = 60.0, flown: list[TensorDi
     )
 
 
-def local(index: int, **world) -> tuple[FlockCollector, list[TensorDictModuleBase]]:
+def local(index: int, **env_config) -> tuple[FlockCollector, list[TensorDictModuleBase]]:
     """What a worker should fly, in this process."""
     seed = derive_seed(SEED, "worker", index)
     flown = behaviour(seed)
-    return FlockCollector(FlockingConfig(**world), SHARES[index], AGENTS, flown, steps=STEPS, seed=seed), flown
+    return FlockCollector(FlockingConfig(**env_config), SHARES[index], AGENTS, flown, steps=STEPS, seed=seed), flown
 
 
 def change(flown: Sequence[TensorDictModuleBase]) -> None:
-    """What trainers do between flights."""
+    """What trainers do between rollouts."""
     with torch.no_grad():
         for parameter in flown[0].parameters():
             parameter.mul_(0.5)
@@ -85,55 +87,55 @@ def change(flown: Sequence[TensorDictModuleBase]) -> None:
 
 
 @pytest.fixture(scope="module")
-def flights() -> Iterator[RemoteFlights]:
-    flights = remote()
-    yield flights
-    flights.close()
+def rollouts() -> Iterator[RemoteCollector]:
+    rollouts = remote()
+    yield rollouts
+    rollouts.close()
 
 
-def assert_flies_as_one_process(flights: RemoteFlights, **world) -> None:
+def assert_flies_as_one_process(rollouts: RemoteCollector, **env_config) -> None:
     """Two calls, with other weights and settings in between."""
-    here = [local(index, **world) for index in range(len(SHARES))]
+    here = [local(index, **env_config) for index in range(len(SHARES))]
     for _ in range(2):
-        there = flights.continue_flights()
-        expected: TensorDictBase = torch.cat([flocks.continue_flights() for flocks, _ in here])
+        there = rollouts.collect()
+        expected: TensorDictBase = torch.cat([flocks.collect() for flocks, _ in here])
         assert there.shape == (sum(SHARES), STEPS)
         assert (there.exclude(IDS) == expected.exclude(IDS)).all()
-        for flown in [flights.behaviour, *(flown for _, flown in here)]:
+        for flown in [rollouts.behaviour, *(flown for _, flown in here)]:
             change(flown)
 
 
 @pytest.mark.slow
-def test_each_worker_flies_as_one_process_would_and_hears_of_changes(flights: RemoteFlights) -> None:
-    assert_flies_as_one_process(flights)
+def test_each_worker_flies_as_one_process_would_and_hears_of_changes(rollouts: RemoteCollector) -> None:
+    assert_flies_as_one_process(rollouts)
 
 
-def test_flights_go_on_and_each_has_an_id_of_its_own(flights: RemoteFlights) -> None:
-    first, second = flights.continue_flights(), flights.continue_flights()
+def test_flights_go_on_and_each_has_an_id_of_its_own(rollouts: RemoteCollector) -> None:
+    first, second = rollouts.collect(), rollouts.collect()
     torch.testing.assert_close(first["next", "agents", "observation"][:, -1], second["agents", "observation"][:, 0])
     torch.testing.assert_close(first["next", "messages"][:, -1], second["messages"][:, 0])
     assert len(second[IDS][:, 0].unique()) == sum(SHARES)
 
 
-def test_flights_go_on_from_a_state(flights: RemoteFlights) -> None:
-    tensors, values = flights.state()
-    noise = [generator.get_state() for generator in flights.generators.values()]
-    flown = flights.continue_flights()
-    assert not (flights.continue_flights() == flown).all()
-    flights.restore(tensors, values)
-    for generator, state in zip(flights.generators.values(), noise, strict=True):
+def test_flights_go_on_from_a_state(rollouts: RemoteCollector) -> None:
+    tensors, values = rollouts.state()
+    noise = [generator.get_state() for generator in rollouts.generators.values()]
+    flown = rollouts.collect()
+    assert not (rollouts.collect() == flown).all()
+    rollouts.restore(tensors, values)
+    for generator, state in zip(rollouts.generators.values(), noise, strict=True):
         generator.set_state(state)
-    assert (flights.continue_flights().exclude(IDS) == flown.exclude(IDS)).all()
+    assert (rollouts.collect().exclude(IDS) == flown.exclude(IDS)).all()
 
 
-def test_error_in_a_worker_is_raised_here(flights: RemoteFlights) -> None:
+def test_error_in_a_worker_is_raised_here(rollouts: RemoteCollector) -> None:
     """The last test of these workers."""
     with torch.no_grad():
-        for parameter in flights.behaviour[0].parameters():
+        for parameter in rollouts.behaviour[0].parameters():
             parameter.fill_(torch.nan)
     with pytest.raises(InputError, match=r"not finite|NaN|nan"):
-        flights.continue_flights()
-    assert all(worker.collector.procs[0].is_alive() for worker in flights._workers)
+        rollouts.collect()
+    assert all(worker.collector.procs[0].is_alive() for worker in rollouts._workers)
 
 
 def test_members_of_an_ensemble_travel_with_its_state() -> None:
@@ -145,7 +147,7 @@ def test_members_of_an_ensemble_travel_with_its_state() -> None:
 
 def test_what_cannot_be_shared_out_or_sent_is_refused_at_once() -> None:
     with pytest.raises(InputError, match=r"collector\.workers=3 cannot share 2 flocks"):
-        RemoteFlights(
+        RemoteCollector(
             FlockingConfig(), 2, 4, behaviour(), steps=1, seed=0, collector=CollectorConfig("process", workers=3)
         )
     with pytest.raises(InputError, match="cannot be sent to other processes"):
@@ -158,11 +160,11 @@ def test_ray_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         remote("ray")
 
 
-def fly_until_replaced(flights: RemoteFlights, process: int) -> TensorDictBase:
-    """The flights in which the second worker was replaced."""
+def fly_until_replaced(rollouts: RemoteCollector, process: int) -> TensorDictBase:
+    """The rollouts in which the second worker was replaced."""
     while True:
-        flown = flights.continue_flights()
-        if flights._workers[1].process != process:
+        flown = rollouts.collect()
+        if rollouts._workers[1].process != process:
             return flown
 
 
@@ -173,23 +175,23 @@ def fly_until_replaced(flights: RemoteFlights, process: int) -> TensorDictBase:
 def test_worker_that_dies_or_hangs_is_replaced(name: str, blow: signal.Signals, delay: float) -> None:
     if name == "ray":
         pytest.importorskip("ray")
-    flights = remote(name, timeout=5)
+    rollouts = remote(name, timeout=5)
     try:
-        before = flights.continue_flights()
-        process = flights._workers[1].process
+        before = rollouts.collect()
+        process = rollouts._workers[1].process
         threading.Timer(delay, os.kill, (process, blow)).start()
         time.sleep(delay / 2)
         start = time.monotonic()
         with pytest.warns(RuntimeWarning, match=rf"worker 1 of the 2 .*process {process}.* its 1 flocks begin anew"):
-            during = fly_until_replaced(flights, process)
+            during = fly_until_replaced(rollouts, process)
         assert time.monotonic() - start < 120
         assert during.shape == before.shape
         assert not is_running(process)
-        after = flights.continue_flights()
+        after = rollouts.collect()
         torch.testing.assert_close(during["next", "agents", "observation"][:, -1], after["agents", "observation"][:, 0])
         assert not set(after[IDS][2].tolist()) & set(before[IDS].flatten().tolist())
     finally:
-        flights.close()
+        rollouts.close()
 
 
 class Dies(TensorDictModuleBase):
@@ -217,22 +219,22 @@ def test_cluster_that_does_not_answer_is_named_at_once() -> None:
 @pytest.mark.filterwarnings("ignore:worker . of the 2:RuntimeWarning")
 def test_worker_that_dies_again_and_again_is_an_error() -> None:
     cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import the tests
-    flights = remote(flown=[*behaviour(), Dies()])
+    rollouts = remote(flown=[*behaviour(), Dies()])
     try:
         with pytest.raises(InputError, match=r"worker 0 .* ended 3 times in a row \(at last: exit code 7\)"):
-            flights.continue_flights()
+            rollouts.collect()
     finally:
-        flights.close()
+        rollouts.close()
 
 
 @pytest.mark.slow
 def test_what_keeps_a_worker_from_starting_is_raised_here() -> None:
-    flights = remote(comm_range=-1.0)
+    rollouts = remote(comm_range=-1.0)
     try:
         with pytest.raises(InputError, match=r"^env\.comm_range=-1\.0 is out of range.*\)$"):
-            flights.continue_flights()
+            rollouts.collect()
     finally:
-        flights.close()
+        rollouts.close()
 
 
 @pytest.mark.slow
@@ -240,11 +242,11 @@ def test_what_keeps_a_worker_from_starting_is_raised_here() -> None:
 def test_other_physics_and_ray_fly_the_same(name: str, physics: str) -> None:
     if name == "ray":
         pytest.importorskip("ray")
-    flights = remote(name, physics=physics)
+    rollouts = remote(name, physics=physics)
     try:
-        assert_flies_as_one_process(flights, physics=physics)
+        assert_flies_as_one_process(rollouts, physics=physics)
     finally:
-        flights.close()
+        rollouts.close()
 
 
 def is_running(process: int) -> bool:

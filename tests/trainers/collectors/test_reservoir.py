@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer
 from modgnn_rl.trainers.collectors.windows import reservoir_places
 
 
@@ -66,9 +66,9 @@ def test_a_loop_written_after_vitter_keeps_the_same():
 
 
 def _flocks(replacement, capacity):
-    settings = DAggerConfig(every=1, capacity=capacity, batch_size=4, replacement=replacement)
+    settings = DAggerConfig(stride=1, capacity=capacity, batch_size=4, replacement=replacement)
     policy = make_model("pair_force", hidden=8, seed=0)
-    return Flocks(FlockingConfig(), settings, 2, 3, [policy], Reynolds(), steps=5, stretch=5, seed=0)
+    return FlockBuffer(FlockingConfig(), settings, 2, 3, [policy], Reynolds(), steps=5, hold_steps=5, seed=0)
 
 
 @pytest.mark.parametrize(("replacement", "oldest"), [("fifo", False), ("reservoir", True)])
@@ -76,9 +76,9 @@ def test_a_reservoir_keeps_old_states_and_a_queue_does_not(replacement, oldest):
     flocks = _flocks(replacement, capacity=25)
     flown = []
     for _ in range(8):  # 10 states each
-        flights = flocks.fly(0.5)
-        flown.append(flights["agents", "observation"].flatten(0, 1))
-        flocks.keep(flights)
+        rollouts = flocks.fly(0.5)
+        flown.append(rollouts["agents", "observation"].flatten(0, 1))
+        flocks.keep(rollouts)
     assert flocks.seen == 80
     assert len(flocks.buffer) == 25
     stored = flocks.buffer[:]["agents", "observation"].squeeze(1)
@@ -104,10 +104,10 @@ def test_a_reservoir_fills_up_before_anything_goes():
     """The round that finds room for a part of its states keeps that part, and draws for the rest."""
     flocks, store = _flocks("reservoir", capacity=25), []
     for _ in range(4):
-        flights = flocks.fly(0.5)
+        rollouts = flocks.fly(0.5)
         draws = flocks.noise.clone_state()
-        flocks.keep(flights)
-        new = list(flights["agents", "observation"].flatten(0, 1))
+        flocks.keep(rollouts)
+        new = list(rollouts["agents", "observation"].flatten(0, 1))
         room, seen = 25 - len(store), flocks.seen - len(new)
         store, new = store + new[:room], new[room:]
         if new:

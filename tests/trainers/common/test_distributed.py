@@ -28,31 +28,38 @@ from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer
 from modgnn_rl.trainers.collectors.local import FlockCollector
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.sampling import random_receivers
-from modgnn_rl.trainers.imitation.learner import Learner
+from modgnn_rl.trainers.imitation.learner import ImitationLearner
 from modgnn_rl.trainers.imitation.loss import imitation_loss
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.trainers.ppo.actor import GaussianActor
-from modgnn_rl.trainers.ppo.learner import Improver
+from modgnn_rl.trainers.ppo.learner import PPOLearner
 from modgnn_rl.utils.signals import Stopped
 
 WORLD = FlockingConfig(num_agents=4, max_steps=15)
-SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "held_out": 2, "checkpoint_minutes": 0}
-DAGGER: Any = {**SMALL, "cloning_steps": 12, "cloning_updates": 4, "rounds": 3, "round_steps": 12, "round_updates": 3}
+SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "num_val_envs": 2, "checkpoint_minutes": 0}
+DAGGER: Any = {
+    **SMALL,
+    "cloning_steps": 12,
+    "cloning_updates": 4,
+    "rounds": 3,
+    "steps_per_round": 12,
+    "updates_per_round": 3,
+}
 RUNS: dict[str, dict[str, Any]] = {
     "bc": {"trainer": BCConfig(**SMALL, cloning_steps=24, cloning_updates=6, dart=True, models=["gcn", "pair_force"])},
-    "dagger": {"trainer": DAggerConfig(**DAGGER, expert_rounds=3)},
+    "dagger": {"trainer": DAggerConfig(**DAGGER, beta_rounds=3)},
     "mappo": {
         "trainer": MAPPOConfig(
             num_envs=2,
-            iterations=3,
-            round_steps=12,
+            rounds=3,
+            steps_per_round=12,
             critic_warmup=1,
             epochs=1,
-            batches=2,
+            num_minibatches=2,
             checkpoint_minutes=0,
             critic_hidden=8,
         ),
@@ -113,14 +120,14 @@ def _assert_close(one, other):
 def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
     settings = DAggerConfig(batch_size=32, learning_rates=[1e-2, 1e-2, 1e-2])
     policy = make_model("modgnn_mlp", seed=0)
-    flocks = Flocks(WORLD, settings, 8, 6, [policy], Reynolds(), steps=20, stretch=20, seed=0)
+    flocks = FlockBuffer(WORLD, settings, 8, 6, [policy], Reynolds(), steps=20, hold_steps=20, seed=0)
     flocks.keep(flocks.fly(1.0))
     chance = torch.Generator().manual_seed(1)
     batches = [_double(flocks.buffer.sample()) for _ in range(4)]
     receivers = [random_receivers(torch.rand(32, 6, generator=chance) < 0.5, 3, chance) for _ in batches]
 
     def learn():
-        learner = Learner(make_model("modgnn_mlp", seed=0).double(), settings, (2, 4), seed=0)
+        learner = ImitationLearner(make_model("modgnn_mlp", seed=0).double(), settings, (2, 4), seed=0)
         parts = [slice(0, split), slice(split, None)]
         part = parts[distributed.rank()] if distributed.size() > 1 else slice(None)
         for batch, chosen in zip(batches, receivers, strict=True):
@@ -138,38 +145,38 @@ def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
 
 
 def test_improving_on_parts_of_the_flights_is_improving_on_the_whole(tmp_path):
-    settings = MAPPOConfig(batches=1, epochs=3, receivers=100, critic_hidden=8, learning_rate=1e-2)
+    settings = MAPPOConfig(num_minibatches=1, epochs=3, agents_per_state=100, critic_hidden=8, learning_rate=1e-2)
     actor = GaussianActor(make_model("moment_force", seed=0), 0.3)
     group = FlockCollector(WORLD, 4, 4, (actor, Reynolds()), steps=10, seed=0)
-    flights = [_double(group.continue_flights().clone()) for _ in range(2)]
+    rollouts = [_double(group.collect().clone()) for _ in range(2)]
     chance = torch.Generator().manual_seed(1)
-    for each in flights:
+    for each in rollouts:
         controlled = each["agents", "controlled"]
         each["agents", "controlled"] = controlled & (torch.rand(controlled.shape, generator=chance) < 0.6)
 
-    def improve():
-        improver = Improver(make_model("moment_force", seed=0), settings, WORLD.state_key, seed=0)
-        for module in (improver.actor, improver.averaged, improver.anchor, improver.critic, improver.loss):
+    def update():
+        learner = PPOLearner(make_model("moment_force", seed=0), settings, WORLD.state_key, seed=0)
+        for module in (learner.actor, learner.averaged, learner.anchor, learner.critic, learner.loss):
             module.double()
-        for number, each in enumerate(flights):
+        for number, each in enumerate(rollouts):
             own = each[2 * distributed.rank() :][:2] if distributed.size() > 1 else each
-            improver.improve(own.clone(), only_critic=number == 0, anchor=0.1)
-        return _weights(improver)
+            learner.update(own.clone(), only_critic=number == 0, anchor=0.1)
+        return _weights(learner)
 
-    alone = improve()
-    for result in _in_two_processes(tmp_path, improve):
+    alone = update()
+    for result in _in_two_processes(tmp_path, update):
         _assert_close(alone, result)
 
 
 def test_all_refuse_what_is_no_number_in_one_process(tmp_path):
     settings = DAggerConfig(on_nonfinite="skip")
     policy = make_model("gcn", seed=0)
-    flocks = Flocks(WORLD, settings, 4, 6, [policy], Reynolds(), steps=20, stretch=20, seed=0)
+    flocks = FlockBuffer(WORLD, settings, 4, 6, [policy], Reynolds(), steps=20, hold_steps=20, seed=0)
     flocks.keep(flocks.fly(1.0))
     batch = flocks.buffer.sample()
 
     def learn(on_nonfinite):
-        learner = Learner(make_model("gcn", seed=0), DAggerConfig(on_nonfinite=on_nonfinite), (2, 4), seed=0)
+        learner = ImitationLearner(make_model("gcn", seed=0), DAggerConfig(on_nonfinite=on_nonfinite), (2, 4), seed=0)
         before, own = _weights(learner)[0], batch.clone()
         if distributed.rank() == 1:
             own["agents", "expert_action"][3, 0, 2] = torch.nan
@@ -232,14 +239,14 @@ def test_weights_that_drift_apart_are_noticed(tmp_path):
 
 
 class Spy(Callback):
-    """Keeps the starts of the flights and the last policies; stops one process in a round."""
+    """Keeps the starts of the rollouts and the last policies; stops one process in a round."""
 
     def __init__(self, stop_at=None, stops=0):
         self.starts, self.stop_at, self.stops = [], stop_at, stops
 
-    def on_flights(self, index, flights):
-        """Look at the flights."""
-        self.starts.append(flights["agents", "observation"][:, 0].clone())
+    def on_flights(self, index, rollouts):
+        """Look at the rollouts."""
+        self.starts.append(rollouts["agents", "observation"][:, 0].clone())
         if index == self.stop_at and distributed.rank() == self.stops:
             os.kill(os.getpid(), signal.SIGTERM)
 

@@ -11,7 +11,7 @@ from torch import nn
 
 from modgnn_rl.configs.schema import DAggerConfig
 from modgnn_rl.errors import NotFinite
-from modgnn_rl.trainers.common.optimization import PATIENCE, Stepper
+from modgnn_rl.trainers.common.optimization import PATIENCE, GuardedOptimizer
 
 ALL = torch.tensor(12)  # agents that count in a batch
 
@@ -24,8 +24,8 @@ def _batch():
 
 def _stepper(on_nonfinite):
     model = nn.Linear(6, 1)
-    settings = DAggerConfig(on_nonfinite=on_nonfinite, max_gradient=0.5)
-    return Stepper(model, torch.optim.SGD(model.parameters(), lr=1.0), settings), model
+    settings = DAggerConfig(on_nonfinite=on_nonfinite, max_grad_norm=0.5)
+    return GuardedOptimizer(model, torch.optim.SGD(model.parameters(), lr=1.0), settings), model
 
 
 def _backward(model, batch):

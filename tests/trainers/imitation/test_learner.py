@@ -11,22 +11,22 @@ import torch
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import Flocks
-from modgnn_rl.trainers.imitation.learner import Learner, cosine_learning_rate
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer
+from modgnn_rl.trainers.imitation.learner import ImitationLearner, cosine_learning_rate
 
 RATES = (3e-3, 1e-3, 1e-4)
 
 
 @pytest.fixture(scope="module")
-def flights():
+def rollouts():
     settings = DAggerConfig(capacity=500, batch_size=64)
-    return Flocks(
-        FlockingConfig(), settings, 8, 6, [make_model("gcn", seed=0)], Reynolds(), steps=40, stretch=40, seed=0
+    return FlockBuffer(
+        FlockingConfig(), settings, 8, 6, [make_model("gcn", seed=0)], Reynolds(), steps=40, hold_steps=40, seed=0
     )
 
 
 def _learner(**settings):
-    return Learner(make_model("pair_force", seed=0), DAggerConfig(batch_size=64, **settings), (20, 60), seed=0)
+    return ImitationLearner(make_model("pair_force", seed=0), DAggerConfig(batch_size=64, **settings), (20, 60), seed=0)
 
 
 def test_learning_rate_passes_its_three_values_without_jumps():
@@ -38,25 +38,25 @@ def test_learning_rate_passes_its_three_values_without_jumps():
     assert all(b <= a for a, b in itertools.pairwise(rates))
 
 
-def test_fitting_lowers_the_loss_and_the_optimiser_goes_on(flights):
-    flights.keep(flights.fly(1.0))
+def test_fitting_lowers_the_loss_and_the_optimiser_goes_on(rollouts):
+    rollouts.keep(rollouts.fly(1.0))
     learner = _learner()
-    before = learner.validate(flights.buffer)
-    learner.fit(flights.buffer, 60)
-    assert learner.validate(flights.buffer) < 0.7 * before
+    before = learner.validate(rollouts.buffer)
+    learner.fit(rollouts.buffer, 60)
+    assert learner.validate(rollouts.buffer) < 0.7 * before
     assert learner.updates_done == 60
     assert learner.learning_rate == pytest.approx(RATES[2])
 
 
-def test_what_flies_is_the_moving_average_of_the_weights(flights):
-    flights.keep(flights.fly(1.0))
-    learner = _learner(averaging=0.9)
+def test_what_flies_is_the_moving_average_of_the_weights(rollouts):
+    rollouts.keep(rollouts.fly(1.0))
+    learner = _learner(ema_decay=0.9)
     expected = copy.deepcopy(learner.policy.state_dict())
     for update in range(5):
-        learner.fit(flights.buffer, 1)
+        learner.fit(rollouts.buffer, 1)
         for key, value in learner.policy.state_dict().items():
             expected[key] = value.clone() if update == 0 else 0.9 * expected[key] + 0.1 * value
-    for key, value in learner.flown.state_dict().items():
+    for key, value in learner.ema_policy.state_dict().items():
         torch.testing.assert_close(value, expected[key])
 
 
@@ -65,12 +65,14 @@ def test_one_seed_fixes_the_weights():
     for _ in range(2):
         settings = DAggerConfig(capacity=500, batch_size=64)
         learner = _learner()
-        group = Flocks(FlockingConfig(), settings, 8, 6, [learner.flown], Reynolds(), steps=40, stretch=40, seed=0)
+        group = FlockBuffer(
+            FlockingConfig(), settings, 8, 6, [learner.ema_policy], Reynolds(), steps=40, hold_steps=40, seed=0
+        )
         group.keep(group.fly(0.5))
         learner.fit(group.buffer, 5)
-        weights.append(torch.cat([parameter.flatten() for parameter in learner.flown.parameters()]))
+        weights.append(torch.cat([parameter.flatten() for parameter in learner.ema_policy.parameters()]))
     assert torch.equal(*weights)
 
 
-def test_no_updates_are_no_loss(flights):
-    assert torch.isnan(torch.tensor(_learner().fit(flights.buffer, 0)))
+def test_no_updates_are_no_loss(rollouts):
+    assert torch.isnan(torch.tensor(_learner().fit(rollouts.buffer, 0)))

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import Flocks
+from modgnn_rl.trainers.collectors.flocks import FlockBuffer
 from modgnn_rl.trainers.collectors.windows import as_windows, stores_messages, window_of
 from modgnn_rl.trainers.common.sampling import random_receivers
 from modgnn_rl.trainers.imitation.loss import hide_velocities, imitation_loss, random_rotations, rotate, stacked_losses
@@ -135,16 +135,18 @@ def test_rotate_turns_each_vector_by_the_matrix_of_its_sample():
     ],
 )
 def test_stored_messages_teach_what_windows_teach(name, model):
-    """Of flights with ends in the middle, from messages as they were flown and as windows make them."""
+    """Of rollouts with ends in the middle, from messages as they were flown and as windows make them."""
     policy = make_model(name, hidden=8, seed=0, **model)
-    settings = DAggerConfig(every=3, capacity=1000, batch_size=16)
-    flocks = Flocks(FlockingConfig(max_steps=6), settings, 4, 4, [policy], Reynolds(), steps=13, stretch=13, seed=0)
+    settings = DAggerConfig(stride=3, capacity=1000, batch_size=16)
+    flocks = FlockBuffer(
+        FlockingConfig(max_steps=6), settings, 4, 4, [policy], Reynolds(), steps=13, hold_steps=13, seed=0
+    )
     assert stores_messages(policy)
     assert flocks.window == 1
-    flights = flocks.fly(0.3)
-    assert bool(flights["is_init"][:, policy.window :].any())
-    made_anew = as_windows(flights.exclude("messages"), policy.window, every=3)
-    stored = as_windows(flights, 1, every=1).view(4, 13)[:, policy.window - 1 :: 3].reshape(-1, 1)
+    rollouts = flocks.fly(0.3)
+    assert bool(rollouts["is_init"][:, policy.window :].any())
+    made_anew = as_windows(rollouts.exclude("messages"), policy.window, stride=3)
+    stored = as_windows(rollouts, 1, stride=1).view(4, 13)[:, policy.window - 1 :: 3].reshape(-1, 1)
     receivers = stored["agents", "controlled"][:, -1]
     losses = [imitation_loss(policy, batch, receivers) for batch in (made_anew, stored)]
     torch.testing.assert_close(losses[0], losses[1])

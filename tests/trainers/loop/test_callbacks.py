@@ -19,15 +19,15 @@ from modgnn_rl.trainers.loop.callbacks import Callback, StopOnPlateau
 
 SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 400}
 TRAINERS = {
-    "bc": BCConfig(**SMALL, cloning_steps=8, cloning_updates=4, held_out=2),
+    "bc": BCConfig(**SMALL, cloning_steps=8, cloning_updates=4, num_val_envs=2),
     "dagger": DAggerConfig(
-        **SMALL, cloning_steps=8, cloning_updates=2, rounds=3, round_steps=4, round_updates=2, held_out=1
+        **SMALL, cloning_steps=8, cloning_updates=2, rounds=3, steps_per_round=4, updates_per_round=2, num_val_envs=1
     ),
     "mappo": MAPPOConfig(
-        num_envs=1, iterations=3, round_steps=4, critic_warmup=0, epochs=1, batches=1, critic_hidden=8
+        num_envs=1, rounds=3, steps_per_round=4, critic_warmup=0, epochs=1, num_minibatches=1, critic_hidden=8
     ),
 }
-# Number of the rounds in which flights come in, and of all rounds.
+# Number of the rounds in which rollouts come in, and of all rounds.
 ROUNDS = {"bc": ([1], [1, 2, 3, 4]), "dagger": ([0, 0, 1, 2, 3], [0, 1, 2, 3]), "mappo": ([1, 2, 3], [1, 2, 3])}
 
 
@@ -55,10 +55,10 @@ class _Watch(Callback):
         self.calls.append(("start", tuple(policies)))
         self.policies = policies
 
-    def on_flights(self, index, flights):
-        self.calls.append(("flights", index))
-        assert flights["agents", "observation"].shape[0] == 8  # flocks of 4: as many agents as 1 of 32
-        assert ("agents", "expert_action") in flights.keys(include_nested=True)
+    def on_flights(self, index, rollouts):
+        self.calls.append(("rollouts", index))
+        assert rollouts["agents", "observation"].shape[0] == 8  # flocks of 4: as many agents as 1 of 32
+        assert ("agents", "expert_action") in rollouts.keys(include_nested=True)
 
     def on_round(self, index, metrics):
         self.calls.append(("round", index))
@@ -77,9 +77,9 @@ def test_the_four_places(tmp_path, name):
     kinds = {kind: [value for called, value in watch.calls if called == kind] for kind, _ in watch.calls}
     assert watch.calls[0] == ("start", ("pair_force",))
     assert watch.calls[-1] == ("end", ("pair_force",))
-    assert (kinds["flights"], kinds["round"]) == ROUNDS[name]
-    # Flights are shown before the round that learns from them is over.
-    assert watch.calls.index(("flights", kinds["flights"][-1])) < watch.calls.index(("round", kinds["flights"][-1]))
+    assert (kinds["rollouts"], kinds["round"]) == ROUNDS[name]
+    # Rollouts are shown before the round that learns from them is over.
+    assert watch.calls.index(("rollouts", kinds["rollouts"][-1])) < watch.calls.index(("round", kinds["rollouts"][-1]))
     written = [{key: value for key, value in line.items() if key != "step"} for line in run.read_metrics()]
     for shown, line in zip(watch.metrics, written, strict=True):
         assert {key: value for key, value in shown.items() if math.isfinite(value)} == {
@@ -103,8 +103,8 @@ def test_any_of_several_callbacks_stops_the_training_and_all_are_called(tmp_path
 @pytest.mark.parametrize("name", ["bc", "dagger"])
 def test_what_a_callback_changes_in_the_flights_is_learned_from(tmp_path, name):
     class Zero(Callback):
-        def on_flights(self, index, flights):
-            flights["agents", "expert_action"].zero_()
+        def on_flights(self, index, rollouts):
+            rollouts["agents", "expert_action"].zero_()
 
     losses = []
     for callbacks in ([], [Zero()]):
@@ -173,18 +173,18 @@ def test_an_expert_of_ones_own_is_learned_from(tmp_path, monkeypatch, name):
         in_keys=[("agents", "observation")],
         out_keys=[("agents", "expert_action")],
     )
-    shared = {"num_envs": 1, "batch_size": 64, "averaging": 0.5, "learning_rates": [1e-2, 1e-2, 1e-2]}
+    shared = {"num_envs": 1, "batch_size": 64, "ema_decay": 0.5, "learning_rates": [1e-2, 1e-2, 1e-2]}
     trainer = {
-        "bc": BCConfig(**shared, cloning_steps=20, cloning_updates=40, held_out=2),
+        "bc": BCConfig(**shared, cloning_steps=20, cloning_updates=40, num_val_envs=2),
         "dagger": DAggerConfig(
             **shared,
             cloning_steps=10,
             cloning_updates=20,
             rounds=3,
-            round_steps=5,
-            round_updates=20,
-            expert_share=0.0,
-            stretch=5,
+            steps_per_round=5,
+            updates_per_round=20,
+            beta=0.0,
+            hold_steps=5,
         ),
     }[name]
     seen = []

@@ -17,30 +17,30 @@ from modgnn_rl.configs.schema import (
     ModelConfig,
     TrainConfig,
 )
-from modgnn_rl.evaluation.rollout import fly, reference_policies
+from modgnn_rl.evaluation.rollout import reference_policies, rollout
 from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.backends import Dashboard
-from modgnn_rl.tracking.loggers import Dashboards
+from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop import dashboard_callback
-from modgnn_rl.trainers.loop.dashboard_callback import Watch, log_evaluation
+from modgnn_rl.trainers.loop.dashboard_callback import DashboardCallback, log_evaluation
 from modgnn_rl.visualization import video
 
 TRAINERS = {
-    "bc": BCConfig(num_envs=1, batch_size=16, cloning_steps=8, cloning_updates=4, held_out=2),
+    "bc": BCConfig(num_envs=1, batch_size=16, cloning_steps=8, cloning_updates=4, num_val_envs=2),
     "dagger": DAggerConfig(
         num_envs=1,
         batch_size=16,
         cloning_steps=8,
         cloning_updates=2,
         rounds=3,
-        round_steps=4,
-        round_updates=2,
-        held_out=1,
+        steps_per_round=4,
+        updates_per_round=2,
+        num_val_envs=1,
     ),
     "mappo": MAPPOConfig(
-        num_envs=1, iterations=3, round_steps=4, critic_warmup=0, epochs=1, batches=1, critic_hidden=8
+        num_envs=1, rounds=3, steps_per_round=4, critic_warmup=0, epochs=1, num_minibatches=1, critic_hidden=8
     ),
 }
 
@@ -100,7 +100,7 @@ def watch(tmp_path):
     config = _config(tmp_path, sizes=[4, 5], video_rounds=100)
     run = RunFolder.create(tmp_path, "dagger", "seed: 0\n")
     policies = {"idle": reference_policies(config.env)["zero action"]}
-    watch = Watch(config, run, Dashboards({"recorder": lambda: recorder}))
+    watch = DashboardCallback(config, run, LoggerGroup({"recorder": lambda: recorder}))
     watch.on_start(policies)
     return watch, recorder
 
@@ -111,7 +111,7 @@ def test_training_is_the_same_to_the_last_bit(tmp_path, name, monkeypatch):
     monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
     monkeypatch.setattr(dashboard_callback, "write_video", lambda *_: None)
     plain = train(_config(tmp_path, name))
-    monkeypatch.setattr(training, "make_logger", lambda *_: Dashboards({"recorder": lambda: recorder}))
+    monkeypatch.setattr(training, "make_logger", lambda *_: LoggerGroup({"recorder": lambda: recorder}))
     watched = train(_config(tmp_path, name, video_rounds=1))
     assert len(recorder.films) == len(watched.read_metrics()) - (name == "dagger")  # which begins with round 0
     assert recorder.tables
@@ -125,11 +125,11 @@ def test_training_is_the_same_to_the_last_bit(tmp_path, name, monkeypatch):
 def test_the_final_table_is_a_table():
     recorder = Recorder()
     figures = {"mean": 1.0, "low": 0.5, "high": 2.0, "std": 3.0}
-    names = ("error", "leader_distance", "cohesion", "separation", "near_collisions", "reward")
+    names = ("error", "leader_distance", "cohesion", "separation", "collision_rate", "reward")
     row = {name: {**figures, "mean": float(number)} for number, name in enumerate(names)}
     row |= {"smallest_distance_ever": 7, "lost": 0.1, "diverged": 0.2}
     alone = row | {"error": None}  # a flock of one has nobody that the policy flies
-    log_evaluation(Dashboards({"recorder": lambda: recorder}), {8: {"mine": row, "alone": alone}})
+    log_evaluation(LoggerGroup({"recorder": lambda: recorder}), {8: {"mine": row, "alone": alone}})
     columns, rows = recorder.tables["evaluation/8"]
     assert columns[:4] == ["flown by", "error", "error, low", "error, high"]
     assert rows[0] == ["mine", 0.0, 0.5, 2.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 0.1, 0.2]
@@ -140,10 +140,10 @@ def test_the_final_table_is_a_table():
 
 def test_reference_lines_are_those_of_the_reference_flights(watch):
     watch, recorder = watch
-    world = watch.config.env
+    env_config = watch.config.env
     for size in (4, 5):
         columns, rows = recorder.tables[f"references/{size}"]
-        assert [row[0] for row in rows] == list(reference_policies(world))
+        assert [row[0] for row in rows] == list(reference_policies(env_config))
         assert dict(zip(columns, rows[-1], strict=True))["error"] == watch.lines[f"{size}/error"]["zero action"] > 0
     watch.on_round(1, {"4/error": 0.5, "pair_force-K1/5/cohesion": 3.0, "error": 0.5, "4/loss": 0.1})
     ((step, lines),) = recorder.references
@@ -154,9 +154,9 @@ def test_reference_lines_are_those_of_the_reference_flights(watch):
     )
     assert lines["4/error"]["expert"] == 0
     seed = dashboard_callback.derive_seed(watch.config.seed, "references", 5)
-    expert = reference_policies(world)["expert"]
-    flights = fly(expert, world, num_agents=5, num_flocks=1, steps=6, seed=seed)
-    assert lines["pair_force-K1/5/cohesion"]["expert"] == float(flights.cohesion.mean())
+    expert = reference_policies(env_config)["expert"]
+    rollouts = rollout(expert, env_config, num_agents=5, num_flocks=1, steps=6, seed=seed)
+    assert lines["pair_force-K1/5/cohesion"]["expert"] == float(rollouts.cohesion.mean())
 
 
 def test_lines_are_drawn_on_each_tenth_round_for_new_metrics_and_at_the_end(watch):
@@ -190,7 +190,7 @@ def test_films_each_so_many_rounds_and_at_the_end(watch):
     watch.on_end({})
     assert torch.equal(before, torch.get_rng_state())
     folder = watch.run.path / "videos"
-    films = [(index, "4/flight", folder / f"round_{index:05d}.mp4") for index in (2, 3)]
+    films = [(index, "4/rollout", folder / f"round_{index:05d}.mp4") for index in (2, 3)]
     assert recorder.films == films
     assert sorted(folder.iterdir()) == [path for *_, path in films]
 
@@ -224,7 +224,7 @@ def test_what_fails_is_left_out_with_one_warning(watch, monkeypatch):
 
 def test_missing_packages_are_said_once(tmp_path, monkeypatch):
     monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
-    watch = Watch(_config(tmp_path), None, Dashboards({"recorder": Recorder}))
+    watch = DashboardCallback(_config(tmp_path), None, LoggerGroup({"recorder": Recorder}))
 
     def use():
         watch.on_start({})

@@ -13,20 +13,22 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig, MAPPOConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.trainers.collectors.local import FlockCollector
-from modgnn_rl.trainers.ppo.learner import RECEIVERS, Improver
+from modgnn_rl.trainers.ppo.learner import RECEIVERS, PPOLearner
 
-WORLD = FlockingConfig(max_steps=8)  # flights end in the middle of the rounds
+WORLD = FlockingConfig(max_steps=8)  # rollouts end in the middle of the rounds
 FLOCKS, AGENTS, STEPS = 4, 5, 10
 
 
-def _improver(name="pair_force", *, model=None, world=WORLD, **settings):
+def _learner(name="pair_force", *, model=None, env_config=WORLD, **settings):
     policy = make_model(name, hidden=8, seed=0, **(model or {}))
-    small = {"window": 3, "epochs": 1, "batches": 2, "critic_hidden": 8}
-    return Improver(policy, MAPPOConfig(**{**small, **settings}), world.state_key, seed=0)
+    small = {"window": 3, "epochs": 1, "num_minibatches": 2, "critic_hidden": 8}
+    return PPOLearner(policy, MAPPOConfig(**{**small, **settings}), env_config.state_key, seed=0)
 
 
-def _collector(improver, *, world=WORLD, steps=STEPS):
-    return FlockCollector(world, FLOCKS, AGENTS, (improver.actor, Reynolds.for_env(world)), steps=steps, seed=0)
+def _collector(learner, *, env_config=WORLD, steps=STEPS):
+    return FlockCollector(
+        env_config, FLOCKS, AGENTS, (learner.actor, Reynolds.for_env(env_config)), steps=steps, seed=0
+    )
 
 
 def _weights(module):
@@ -37,45 +39,45 @@ def _weights(module):
     ("name", "model"),
     [("mpnn", {}), ("mpnn", {"layers": 2}), ("pair_force", {"layers": 2}), ("modgnn_mlp", {"hops": 2})],
 )
-@pytest.mark.parametrize("world", [WORLD, FlockingConfig(max_steps=8, dropout_rate=2.0, delay=1)])
-def test_before_the_first_update_what_was_flown_is_recomputed_exactly(name, model, world):
-    improver = _improver(name, model=model, world=world)
-    collector = _collector(improver, world=world)
-    before, began = copy.deepcopy(improver.actor.state_dict()), 0
+@pytest.mark.parametrize("env_config", [WORLD, FlockingConfig(max_steps=8, dropout_rate=2.0, delay=1)])
+def test_before_the_first_update_what_was_flown_is_recomputed_exactly(name, model, env_config):
+    learner = _learner(name, model=model, env_config=env_config)
+    collector = _collector(learner, env_config=env_config)
+    before, began = copy.deepcopy(learner.actor.state_dict()), 0
     for _ in range(3):
-        flights = collector.continue_flights()
-        began += int(flights["is_init"][:, 1:].sum())
-        assert abs(improver.improve(flights, only_critic=True)["kl_approx"]) < 1e-6
+        rollouts = collector.collect()
+        began += int(rollouts["is_init"][:, 1:].sum())
+        assert abs(learner.update(rollouts, only_critic=True)["kl_approx"]) < 1e-6
     assert began > 0
-    assert all(torch.equal(value, before[key]) for key, value in improver.actor.state_dict().items())
-    assert torch.equal(_weights(improver.flown), _weights(improver.policy))
+    assert all(torch.equal(value, before[key]) for key, value in learner.actor.state_dict().items())
+    assert torch.equal(_weights(learner.ema_policy), _weights(learner.policy))
 
 
 def test_without_burn_in_learned_messages_would_not_be_those_flown():
     """What the law above guards against: messages that came into a round are of older weights."""
-    improver = _improver("mpnn", model={"layers": 2})
-    assert improver.burn_in == 2
-    collector = _collector(improver)
-    collector.continue_flights()
+    learner = _learner("mpnn", model={"layers": 2})
+    assert learner.burn_in == 2
+    collector = _collector(learner)
+    collector.collect()
     with torch.no_grad():
-        for parameter in improver.policy.parameters():
+        for parameter in learner.policy.parameters():
             parameter.mul_(1.5)
-    flights = collector.continue_flights()
+    rollouts = collector.collect()
     with set_recurrent_mode(True):
-        action = improver.policy(flights.select(*improver.policy.in_keys, strict=False))["agents", "action"]
-    difference = (action - flights["agents", "loc"]).abs().amax((0, 2, 3))
+        action = learner.policy(rollouts.select(*learner.policy.in_keys, strict=False))["agents", "action"]
+    difference = (action - rollouts["agents", "loc"]).abs().amax((0, 2, 3))
     assert difference[2:].max() < 1e-5
     # The same without the stored messages, as it is at windows in the middle of a round.
-    part = flights[:, 1:].exclude("messages").select(*improver.policy.in_keys, strict=False)
+    part = rollouts[:, 1:].exclude("messages").select(*learner.policy.in_keys, strict=False)
     with set_recurrent_mode(True):
-        action = improver.policy(part)["agents", "action"]
-    difference = (action - flights["agents", "loc"][:, 1:]).abs().amax((0, 2, 3))
+        action = learner.policy(part)["agents", "action"]
+    difference = (action - rollouts["agents", "loc"][:, 1:]).abs().amax((0, 2, 3))
     assert difference[0] > 1e-4
     assert difference[2:].max() < 1e-5
 
 
 def _gae(reward, value, next_value, done, discount, trace):
-    """Generalised advantages of one agent, as a loop; the end of a flight is worth what its last state is worth."""
+    """Generalised advantages of one agent, as a loop; the end of a rollout is worth what its last state is worth."""
     advantage, later = [0.0] * len(reward), 0.0
     for t in reversed(range(len(reward))):
         surprise = (1 - discount) * reward[t] + discount * next_value[t] - value[t]
@@ -84,72 +86,72 @@ def _gae(reward, value, next_value, done, discount, trace):
     return advantage
 
 
-@pytest.mark.parametrize("world", [WORLD, FlockingConfig(max_steps=8, dropout_rate=2.0)])
-def test_advantages_are_those_of_a_loop(world):
-    improver = _improver(discount=0.9, trace=0.8, world=world)
-    flights = _collector(improver, world=world).continue_flights()
-    flights["next", "terminated"][1, 4] = flights["next", "done"][1, 4] = True  # two ends that are no truncation
-    flights["next", "terminated"][2, 5] = flights["next", "done"][2, 5] = True
-    improver.judge(flights)
+@pytest.mark.parametrize("env_config", [WORLD, FlockingConfig(max_steps=8, dropout_rate=2.0)])
+def test_advantages_are_those_of_a_loop(env_config):
+    learner = _learner(gamma=0.9, gae_lambda=0.8, env_config=env_config)
+    rollouts = _collector(learner, env_config=env_config).collect()
+    rollouts["next", "terminated"][1, 4] = rollouts["next", "done"][1, 4] = True  # two ends that are no truncation
+    rollouts["next", "terminated"][2, 5] = rollouts["next", "done"][2, 5] = True
+    learner.compute_advantages(rollouts)
     value, next_value = (
-        improver.critic(part.clone())["agents", "state_value"].detach() for part in (flights, flights["next"])
+        learner.critic(part.clone())["agents", "state_value"].detach() for part in (rollouts, rollouts["next"])
     )
-    assert bool(flights["next", "truncated"].any())
+    assert bool(rollouts["next", "truncated"].any())
     expected = torch.zeros(FLOCKS, STEPS, AGENTS)
     for flock in range(FLOCKS):
         for agent in range(AGENTS):
             of_agent = [
                 tensor[flock, :, agent, 0].tolist()
-                for tensor in (flights["next", "agents", "reward"], value, next_value)
+                for tensor in (rollouts["next", "agents", "reward"], value, next_value)
             ]
-            done = flights["next", "done"][flock, :, 0].tolist()
+            done = rollouts["next", "done"][flock, :, 0].tolist()
             expected[flock, :, agent] = torch.tensor(_gae(*of_agent, done, 0.9, 0.8))
     torch.testing.assert_close(
-        flights["agents", "value_target"].squeeze(-1), expected + value.squeeze(-1), rtol=1e-4, atol=1e-5
+        rollouts["agents", "value_target"].squeeze(-1), expected + value.squeeze(-1), rtol=1e-4, atol=1e-5
     )
-    flown = flights["agents", "controlled"]
+    flown = rollouts["agents", "controlled"]
     normalised = (expected - expected[flown].mean()) / expected[flown].std()
-    torch.testing.assert_close(flights["agents", "advantage"].squeeze(-1), normalised, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(rollouts["agents", "advantage"].squeeze(-1), normalised, rtol=1e-3, atol=1e-4)
 
 
 def test_judging_leaves_the_flights_as_they_were_flown():
-    improver = _improver()
-    flights = _collector(improver).continue_flights()
-    before = flights.clone()
-    improver.judge(flights)
+    learner = _learner()
+    rollouts = _collector(learner).collect()
+    before = rollouts.clone()
+    learner.compute_advantages(rollouts)
     for key, value in before.items(include_nested=True, leaves_only=True):
-        assert torch.equal(flights[key].nan_to_num(7.0), value.nan_to_num(7.0)), key
+        assert torch.equal(rollouts[key].nan_to_num(7.0), value.nan_to_num(7.0)), key
 
 
-def _losses(improver, flights, receivers, anchor):
-    improver.loss.anchor_coeff = anchor
-    improver.judge(flights)
-    batch = flights.copy()
+def _losses(learner, rollouts, receivers, anchor):
+    learner.loss.anchor_coeff = anchor
+    learner.compute_advantages(rollouts)
+    batch = rollouts.copy()
     batch[RECEIVERS] = receivers
     batch["collector", "mask"] = receivers.unsqueeze(-1)
-    return improver.loss(batch)
+    return learner.loss(batch)
 
 
 def test_losses_are_those_of_torch_distributions():
-    improver = _improver("modgnn_mlp", noise=0.4, entropy=0.01)
-    flights = _collector(improver).continue_flights()
+    learner = _learner("modgnn_mlp", noise=0.4, entropy_coef=0.01)
+    rollouts = _collector(learner).collect()
     with torch.no_grad():
-        for parameter in improver.actor.parameters():
+        for parameter in learner.actor.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
-    receivers = flights["agents", "controlled"] & (torch.arange(AGENTS) != 3)
-    losses = _losses(improver, flights, receivers, anchor=0.7)
+    receivers = rollouts["agents", "controlled"] & (torch.arange(AGENTS) != 3)
+    losses = _losses(learner, rollouts, receivers, anchor=0.7)
     with set_recurrent_mode(True):
         mean, old = (
-            policy(flights.select(*policy.in_keys, strict=False))["agents", "action"]
-            for policy in (improver.policy, improver.anchor)
+            policy(rollouts.select(*policy.in_keys, strict=False))["agents", "action"]
+            for policy in (learner.policy, learner.anchor)
         )
-    sigma = improver.actor.noise
+    sigma = learner.actor.noise
     now, anchor = (Independent(Normal(centre, sigma), 1) for centre in (mean, old))
     torch.testing.assert_close(losses["loss_anchor"], 0.7 * kl_divergence(now, anchor)[receivers].mean())
     torch.testing.assert_close(losses["loss_entropy"], -0.01 * now.entropy()[receivers].mean())
 
-    log_ratio = (now.log_prob(flights["agents", "action"]) - flights["agents", "action_log_prob"])[receivers]
-    ratio, advantage = log_ratio.exp(), flights["agents", "advantage"].squeeze(-1)[receivers]
+    log_ratio = (now.log_prob(rollouts["agents", "action"]) - rollouts["agents", "action_log_prob"])[receivers]
+    ratio, advantage = log_ratio.exp(), rollouts["agents", "advantage"].squeeze(-1)[receivers]
     assert 0 < ((ratio - 1).abs() > 0.2).float().mean() < 1
     gain = torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage)
     torch.testing.assert_close(losses["loss_objective"], -gain.mean(), rtol=1e-4, atol=1e-5)
@@ -162,33 +164,33 @@ def test_the_leader_and_the_burn_in_reach_no_gradient(name, model):
     """Whatever advantages and targets they have, the weights after an update are the same."""
     weights = []
     for rubbish in (0.0, 1e3):
-        improver = _improver(name, model=model)
-        flights = _collector(improver).continue_flights()
-        judge = improver.judge
+        learner = _learner(name, model=model)
+        rollouts = _collector(learner).collect()
+        compute_advantages = learner.compute_advantages
 
-        def spoiled(flights, judge=judge, rubbish=rubbish):
-            judge(flights)
+        def spoiled(rollouts, judge=judge, rubbish=rubbish):
+            judge(rollouts)
             for key in ("advantage", "action_log_prob"):
-                flights["agents", key][:, :, 0] += rubbish
+                rollouts["agents", key][:, :, 0] += rubbish
 
-        improver.judge = spoiled
-        improver.improve(flights, anchor=0.1)
-        weights.append((_weights(improver.policy), _weights(improver.actor)))
+        learner.compute_advantages = spoiled
+        learner.update(rollouts, anchor=0.1)
+        weights.append((_weights(learner.policy), _weights(learner.actor)))
     assert torch.equal(weights[0][0], weights[1][0])
     assert torch.equal(weights[0][1], weights[1][1])
 
 
 def test_steps_of_the_burn_in_are_not_chosen():
-    improver = _improver("mpnn", model={"layers": 2})
+    learner = _learner("mpnn", model={"layers": 2})
     seen = []
-    forward = improver.loss.forward
+    forward = learner.loss.forward
 
     def watched(batch):
         seen.append((batch[RECEIVERS].clone(), batch["agents", "controlled"].clone()))
         return forward(batch)
 
-    improver.loss.forward = watched
-    improver.improve(_collector(improver).continue_flights())
+    learner.loss.forward = watched
+    learner.update(_collector(learner).collect())
     assert len(seen) == 2
     assert sum(len(chosen) for chosen, _ in seen) == FLOCKS * ((STEPS - 2) // 3)  # windows of 2 + 3 steps
     for chosen, controlled in seen:
@@ -199,31 +201,31 @@ def test_steps_of_the_burn_in_are_not_chosen():
 def test_a_huge_anchor_keeps_the_policy_where_it_began():
     moved = []
     for anchor in (0.0, 1e3):
-        improver = _improver("modgnn_mlp", learning_rate=3e-3, epochs=2)
-        collector = _collector(improver)
+        learner = _learner("modgnn_mlp", learning_rate=3e-3, epochs=2)
+        collector = _collector(learner)
         for _ in range(3):
-            flights = collector.continue_flights()
-            improver.improve(flights, anchor=anchor)
-        data = flights.select(*improver.policy.in_keys, strict=False)
+            rollouts = collector.collect()
+            learner.update(rollouts, anchor=anchor)
+        data = rollouts.select(*learner.policy.in_keys, strict=False)
         with torch.no_grad(), set_recurrent_mode(True):
-            action, before = (policy(data.copy())["agents", "action"] for policy in (improver.policy, improver.anchor))
-        moved.append(float((action - before)[flights["agents", "controlled"]].square().mean().sqrt()))
+            action, before = (policy(data.copy())["agents", "action"] for policy in (learner.policy, learner.anchor))
+        moved.append(float((action - before)[rollouts["agents", "controlled"]].square().mean().sqrt()))
     assert moved[1] < 0.3 * moved[0]
 
 
 def test_the_losses_of_a_critic_fall():
-    improver = _improver(critic_learning_rate=1e-2, epochs=4)
-    flights = _collector(improver).continue_flights()
-    losses = [improver.improve(flights.clone(), only_critic=True)["loss_critic"] for _ in range(6)]
+    learner = _learner(critic_learning_rate=1e-2, epochs=4)
+    rollouts = _collector(learner).collect()
+    losses = [learner.update(rollouts.clone(), only_critic=True)["loss_critic"] for _ in range(6)]
     assert losses[-1] < 0.5 * losses[0]
 
 
 def test_updates_move_policy_sigma_and_average():
-    improver = _improver(averaging=0.5)
-    before = {name: value.clone() for name, value in improver.actor.state_dict().items()}
-    improver.improve(_collector(improver).continue_flights())
-    assert improver.updates_done == 2
-    assert all(not torch.equal(value, before[name]) for name, value in improver.actor.state_dict().items())
-    assert not torch.equal(_weights(improver.flown), _weights(improver.policy))
+    learner = _learner(ema_decay=0.5)
+    before = {name: value.clone() for name, value in learner.actor.state_dict().items()}
+    learner.update(_collector(learner).collect())
+    assert learner.updates_done == 2
+    assert all(not torch.equal(value, before[name]) for name, value in learner.actor.state_dict().items())
+    assert not torch.equal(_weights(learner.ema_policy), _weights(learner.policy))
     began = torch.cat([value.flatten().double() for name, value in before.items() if "policy" in name])
-    assert torch.equal(_weights(improver.anchor), began)
+    assert torch.equal(_weights(learner.anchor), began)

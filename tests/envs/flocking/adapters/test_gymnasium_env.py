@@ -69,15 +69,15 @@ def test_it_is_the_environment_behind_it() -> None:
 
 
 def test_seeds_fix_flights_and_data_are_copies() -> None:
-    flights = []
+    rollouts = []
     for seed in (1, 1, 2):
         env = make()
         first, _ = env.reset(seed=seed)
         kept = first["observation"].copy()
-        flights.append([env.step(actions(4, seed=step))[0]["observation"] for step in range(5)])
+        rollouts.append([env.step(actions(4, seed=step))[0]["observation"] for step in range(5)])
         assert np.array_equal(first["observation"], kept)
-    assert np.array_equal(flights[0], flights[1])
-    assert not np.array_equal(flights[0], flights[2])
+    assert np.array_equal(rollouts[0], rollouts[1])
+    assert not np.array_equal(rollouts[0], rollouts[2])
 
 
 def test_flights_end() -> None:
