@@ -168,8 +168,8 @@ def test_the_leader_and_the_burn_in_reach_no_gradient(name, model):
         rollouts = _collector(learner).collect()
         compute_advantages = learner.compute_advantages
 
-        def spoiled(rollouts, judge=judge, rubbish=rubbish):
-            judge(rollouts)
+        def spoiled(rollouts, compute_advantages=compute_advantages, rubbish=rubbish):
+            compute_advantages(rollouts)
             for key in ("advantage", "action_log_prob"):
                 rollouts["agents", key][:, :, 0] += rubbish
 
