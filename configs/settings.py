@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import difflib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from modgnn_rl.errors import InputError
+from modgnn_rl.errors import InputError, suggestion
 
-__all__ = ["check", "flat", "setting", "suggestion"]
+__all__ = ["check", "flat", "setting"]
 
 
 def setting(
@@ -115,9 +114,3 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in tree.items():
         leaves |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return leaves
-
-
-def suggestion(word: str, known: Iterable[str]) -> str:
-    """Return ``"; did you mean 'x'?"`` for the known word nearest to ``word``, or an empty string."""
-    near = difflib.get_close_matches(word, list(known), n=1)
-    return f"; did you mean '{near[0]}'?" if near else ""

@@ -1,4 +1,4 @@
-"""``python -m modgnn_rl``: what there is, and what to try first."""
+"""``python -m modgnn_rl``: an overview of the commands."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import sys
 
 import modgnn_rl
 from modgnn_rl.cli.overview import commands, completion, overview
-from modgnn_rl.configs.settings import suggestion
-from modgnn_rl.errors import InputError
+from modgnn_rl.errors import InputError, suggestion
 
 
 def main(arguments: list[str]) -> int:
@@ -32,10 +31,10 @@ def main(arguments: list[str]) -> int:
 
 
 def _not_understood(word: str) -> str:
-    """What to write instead of a word that this module has no use for."""
+    """Say what to type instead of an unexpected word."""
     if word in (found := commands()):
-        return f"a command is a module of its own: python -m modgnn_rl.{word}"
-    return f"{word} is no command{suggestion(word, found) or '; the commands are ' + ', '.join(found)}"
+        return f"commands are modules: use python -m modgnn_rl.{word}"
+    return f"unknown command '{word}'{suggestion(word, found) or '; the commands are ' + ', '.join(found)}"
 
 
 if __name__ == "__main__":

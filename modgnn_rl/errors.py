@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-__all__ = ["InputError", "NotFinite", "one_line"]
+import difflib
+from collections.abc import Iterable
+
+__all__ = ["InputError", "NotFinite", "one_line", "suggestion"]
 
 
 class InputError(ValueError):
@@ -23,3 +26,9 @@ class NotFinite(InputError):
 def one_line(error: BaseException) -> str:
     """The first line of what an exception says, or its kind where it says nothing."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """Return ``"; did you mean 'x'?"`` for the known word nearest to ``word``, or an empty string."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""

@@ -8,9 +8,12 @@ Something is registered where it is defined, with a decorator::
     @MODELS.register("gcn", layers=1)
     def gcn(spec: LayerSpec) -> ModGNNLayer: ...
 
-What the library brings is found by reading its files, not by importing them, so that ``--help`` and error messages need
-not wait for torch; the file is imported when the entry is used. A script registers its own by running the decorator,
-an installed package through an entry point.
+The library's own entries are found by reading its files, not by importing them, so that ``--help`` and error messages
+need not wait for torch; a file is imported when its entry is used. A script registers its entries by running the
+decorator, an installed package through an entry point, which is imported when its entry is used::
+
+    [project.entry-points."modgnn_rl.models"]
+    my_model = "my_package.my_module:my_model"
 """
 
 from __future__ import annotations
@@ -18,18 +21,17 @@ from __future__ import annotations
 import ast
 import functools
 import importlib
+import importlib.util
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar
 
-from modgnn_rl.configs.settings import suggestion
-from modgnn_rl.errors import InputError
+from modgnn_rl.errors import InputError, suggestion
 
 __all__ = ["METRICS", "MODELS", "TRAINERS", "Entry", "Reference", "Registry"]
 
-ROOT = Path(__file__).parent
 T = TypeVar("T")
 
 
@@ -78,20 +80,24 @@ class Registry(Mapping[str, Entry]):
     Args:
         kind: what an entry is, for messages, as in ``"model"``.
         variable: name of the registry where it is used as a decorator, as in ``"MODELS"``.
-        folder: folder under ``modgnn_rl/`` whose files are read.
-        plugins: group of the entry points by which installed packages bring entries of their own; default: none.
+        package: package whose files are read, as in ``"modgnn_rl.models"``.
+        plugins: group of the entry points through which installed packages add entries; default: none.
     """
 
-    def __init__(self, kind: str, variable: str, folder: str, *, plugins: str | None = None) -> None:
-        self.kind, self.variable, self.folder, self.plugins = kind, variable, folder, plugins
+    def __init__(self, kind: str, variable: str, package: str, *, plugins: str | None = None) -> None:
+        self.kind, self.variable, self.package, self.plugins = kind, variable, package, plugins
         self._added: dict[str, Entry] = {}
 
     @functools.cached_property
     def built_in(self) -> dict[str, Entry]:
         """The entries of the library's own files, in the order of files and lines."""
         found: dict[str, Entry] = {}
-        for path in sorted((ROOT / self.folder).rglob("*.py")):
-            found |= {entry.name: entry for entry in _read(path, self.variable)}
+        # The package knows its folder, whether that is a link, mapped by an editable installation, or in a wheel.
+        spec = importlib.util.find_spec(self.package)
+        for folder in map(Path, spec.submodule_search_locations or [] if spec else []):
+            for path in sorted(folder.rglob("*.py")):
+                module = ".".join([self.package, *path.relative_to(folder).with_suffix("").parts])
+                found |= {entry.name: entry for entry in _read(path, module, self.variable)}
         return found
 
     def register(self, name: str, **options: Any) -> Callable[[T], T]:
@@ -99,7 +105,7 @@ class Registry(Mapping[str, Entry]):
 
         Args:
             name: a new name, or one registered before: the new object replaces the old one.
-            options: what else the registry's users want to know.
+            options: further facts about the entry, such as ``settings=`` of a trainer.
 
         Raises:
             InputError: the name belongs to an entry of the library.
@@ -119,16 +125,22 @@ class Registry(Mapping[str, Entry]):
         """All names, the library's first."""
         return list(self)
 
+    def peek(self, name: str) -> Entry | None:
+        """The entry of a name if it is known without importing an installed package."""
+        return self._added.get(name) or self.built_in.get(name)
+
     def __getitem__(self, name: str) -> Entry:
         """The entry of a name; an installed package's is imported now.
 
         Raises:
-            InputError: there is none.
+            InputError: unknown name.
         """
-        if name not in self._added and name not in self.built_in and self.plugins is not None:
+        if self.peek(name) is None and self.plugins is not None:
             for plugin in entry_points(group=self.plugins, name=name):
-                self.register(name)(plugin.load())
-        entry = self._added.get(name) or self.built_in.get(name)
+                target = plugin.load()  # which may run the decorator
+                if name not in self._added:
+                    self.register(name)(target)
+        entry = self.peek(name)
         if entry is None:
             names = self.names()
             raise InputError(f"{self.kind} '{name}' is not one of {', '.join(names)}{suggestion(name, names)}")
@@ -145,12 +157,11 @@ class Registry(Mapping[str, Entry]):
         return name in list(self)
 
 
-def _read(path: Path, variable: str) -> Iterator[Entry]:
-    """Yield what a file registers with ``@<variable>.register(...)`` at its top level."""
+def _read(path: Path, module: str, variable: str) -> Iterator[Entry]:
+    """Yield what a module's file registers with ``@<variable>.register(...)`` at its top level."""
     source = path.read_text(encoding="utf-8")
     if f"@{variable}.register(" not in source:
         return
-    module = ".".join(["modgnn_rl", *path.relative_to(ROOT).with_suffix("").parts])
     body = ast.parse(source).body
     imports = {
         alias.asname or alias.name: Reference(str(node.module), alias.name)
@@ -175,6 +186,6 @@ def _value(node: ast.expr, module: str, imports: Mapping[str, Reference]) -> Any
     return ast.literal_eval(node)
 
 
-MODELS = Registry("model", "MODELS", "models", plugins="modgnn_rl.models")
-TRAINERS = Registry("trainer", "TRAINERS", "trainers", plugins="modgnn_rl.trainers")
-METRICS = Registry("metric", "METRICS", "envs")
+MODELS = Registry("model", "MODELS", "modgnn_rl.models", plugins="modgnn_rl.models")
+TRAINERS = Registry("trainer", "TRAINERS", "modgnn_rl.trainers", plugins="modgnn_rl.trainers")
+METRICS = Registry("metric", "METRICS", "modgnn_rl.envs")

@@ -13,7 +13,6 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.errors import HydraException
@@ -23,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from modgnn_rl.configs import schema
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
+from modgnn_rl.utils.internals import parse_hydra_flags
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -140,7 +140,7 @@ def compose(line: str, generate: ModuleType) -> None:
     """Apply a command line to a command's settings and check them; Hydra would take half a second for each."""
     name, *arguments = shlex.split(line)
     command = {command.name: command for command in generate.commands()}[name]
-    flags = get_args_parser().parse_args(arguments)
+    flags = parse_hydra_flags(arguments)
     if flags.shell_completion:
         return
     overrides = {o.key_or_group: o for o in OverridesParser.create().parse_overrides(flags.overrides)}

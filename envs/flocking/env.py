@@ -13,7 +13,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, MarlGroupMapType
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, as_list
-from modgnn_rl.configs.settings import check, suggestion
+from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.faults import Faults
 from modgnn_rl.envs.flocking.leader import make_leader
 from modgnn_rl.envs.flocking.nonfinite import complaint, lost_flocks, unusable
@@ -22,7 +22,7 @@ from modgnn_rl.envs.flocking.radio import hear_all_pairs, hear_near_pairs
 from modgnn_rl.envs.flocking.rewards import LIMITS, judge, reward_weights
 from modgnn_rl.envs.flocking.snapshots import refuse_foreign
 from modgnn_rl.envs.flocking.starts import start_positions
-from modgnn_rl.errors import InputError
+from modgnn_rl.errors import InputError, suggestion
 from modgnn_rl.utils.compile import compiled
 from modgnn_rl.utils.seeds import derive_seed
 from modgnn_rl.utils.tensors import clip_to_ball

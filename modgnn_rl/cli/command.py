@@ -36,7 +36,6 @@ from typing import Any, TypeVar
 
 import hydra
 import yaml
-from hydra._internal.utils import get_args_parser
 from hydra.conf import HelpConf, HydraConf, JobConf, RunDir, SweepDir
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
@@ -52,8 +51,9 @@ from omegaconf.errors import (
 
 from modgnn_rl.cli.help import children, fields, help_text
 from modgnn_rl.cli.overview import completion
-from modgnn_rl.configs.settings import check, suggestion
-from modgnn_rl.errors import InputError
+from modgnn_rl.configs.settings import check
+from modgnn_rl.errors import InputError, suggestion
+from modgnn_rl.utils.internals import parse_hydra_flags
 from modgnn_rl.utils.signals import Stopped
 
 __all__ = ["run_command", "settings_given"]
@@ -208,7 +208,7 @@ def _flags() -> argparse.Namespace:
     output = io.StringIO()
     try:
         with contextlib.redirect_stderr(output):
-            return get_args_parser().parse_args()
+            return parse_hydra_flags(sys.argv[1:])
     except SystemExit as stop:
         if not stop.code:
             raise

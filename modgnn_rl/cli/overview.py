@@ -8,8 +8,7 @@ import textwrap
 from pathlib import Path
 
 import modgnn_rl
-from modgnn_rl.configs.settings import suggestion
-from modgnn_rl.errors import InputError
+from modgnn_rl.errors import InputError, suggestion
 
 __all__ = ["commands", "completion", "overview"]
 

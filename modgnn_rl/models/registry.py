@@ -15,8 +15,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from modgnn_rl.configs.schema import BUILT_IN_MODELS, MODEL_NAMES, MODEL_PLUGINS, FlockingConfig, ModelConfig
-from modgnn_rl.configs.settings import suggestion
-from modgnn_rl.errors import InputError
+from modgnn_rl.errors import InputError, suggestion
 from modgnn_rl.models.blocks import BallHead, LayerSpec
 from modgnn_rl.models.central import CentralLayer
 from modgnn_rl.models.equivariant import PairForce, moment_force, pair_force

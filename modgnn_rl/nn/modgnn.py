@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from torchrl.modules import recurrent_mode
 
-from modgnn_rl.configs.settings import suggestion
-from modgnn_rl.errors import InputError
+from modgnn_rl.errors import InputError, suggestion
 from modgnn_rl.nn.aggregation import suited_form
 from modgnn_rl.nn.graph import Graph
 from modgnn_rl.nn.layer import ModGNNLayer

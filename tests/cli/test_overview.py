@@ -49,8 +49,8 @@ def test_it_is_as_wide_as_the_terminal(monkeypatch, width):
     ("arguments", "code", "out", "err"),
     [
         (["--version"], 0, f"modgnn_rl {modgnn_rl.__version__}\n", ""),
-        (["train", "seed=1"], 2, "", "error: a command is a module of its own: python -m modgnn_rl.train\n"),
-        (["evalute"], 2, "", "error: evalute is no command; did you mean 'evaluate'?\n"),
+        (["train", "seed=1"], 2, "", "error: commands are modules: use python -m modgnn_rl.train\n"),
+        (["evalute"], 2, "", "error: unknown command 'evalute'; did you mean 'evaluate'?\n"),
         (
             ["--completion", "fisch"],
             2,

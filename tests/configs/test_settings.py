@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from modgnn_rl.configs import schema
-from modgnn_rl.configs.settings import check, setting, suggestion
-from modgnn_rl.errors import InputError
+from modgnn_rl.configs.settings import check, setting
+from modgnn_rl.errors import InputError, suggestion
 
 
 @dataclass

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.configs.settings import suggestion
 from modgnn_rl.envs.flocking.env import FlockingEnv
 from modgnn_rl.envs.flocking.rendering.renderer import RENDER_MODES, Flock, Renderer, check_render_mode, has_display
-from modgnn_rl.errors import InputError
+from modgnn_rl.errors import InputError, suggestion
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["Flocks", "GymnasiumFlocking", "GymnasiumFlocks", "as_array"]

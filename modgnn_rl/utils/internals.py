@@ -1,0 +1,32 @@
+"""Private names of other libraries, each with the reason why no public one serves.
+
+A new version of such a library may break what is here and nothing else; ``tests/utils/test_internals.py`` says how.
+Libraries are imported inside the functions: the command line imports this module and must not wait for torch.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+__all__ = ["parse_hydra_flags"]
+
+
+def parse_hydra_flags(arguments: Sequence[str]) -> argparse.Namespace:
+    """The flags and overrides of a command line as `hydra.main` will read them.
+
+    `hydra.main` parses ``sys.argv`` itself and keeps its parser private. A command needs to know beforehand whether it
+    runs one job or several, and to report an unknown flag in one line.
+
+    Args:
+        arguments: command line without the program's name.
+
+    Returns:
+        namespace with ``overrides``, ``multirun``, ``shell_completion``, ``config_dir`` and Hydra's other flags.
+
+    Raises:
+        SystemExit: for an unknown flag, after argparse has printed its usage.
+    """
+    from hydra._internal.utils import get_args_parser
+
+    return get_args_parser().parse_args(list(arguments))
