@@ -30,7 +30,7 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.envs.flocking.physics.quadcopter import Dynamics
-from modgnn_rl.models.registry import make_model
+from modgnn_rl.models.factory import make_model
 
 REPETITIONS = 5
 BULLET_FLOCKS = 4

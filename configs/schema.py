@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
-from importlib.metadata import entry_points
 from typing import Any
 
 from omegaconf import MISSING
 
 from modgnn_rl.configs.settings import setting
+from modgnn_rl.registry import MODELS
 
 __all__ = [
     "REFERENCE_SIZE",
@@ -38,21 +38,6 @@ __all__ = [
 ]
 
 
-BUILT_IN_MODELS = (
-    "moment_force",
-    "pair_force",
-    "modgnn_mlp",
-    "modgnn_adjacency",
-    "no_pre",
-    "no_mid",
-    "gcn",
-    "gcn_final",
-    "central",
-    "gat",
-    "mpnn",
-)
-MODEL_PLUGINS = "modgnn_rl.models"  # group of the entry points by which installed packages bring models
-MODEL_NAMES = [*BUILT_IN_MODELS, *sorted(entry_points(group=MODEL_PLUGINS).names)]  # register_model adds to it
 LOGGER_NAMES = ("none", "csv", "tensorboard", "wandb")
 REFERENCE_SIZE = 32  # the flock size to which start_radius, num_envs and receivers refer
 
@@ -207,7 +192,7 @@ EnvOverrides = make_dataclass(
 class ModelConfig:
     """The policy: one of the models of `modgnn_rl.models`."""
 
-    name: str = setting("moment_force", "model", choices=MODEL_NAMES)
+    name: str = setting("moment_force", "model", choices=MODELS)
     hops: int = setting(1, "communication hops K of each layer", ge=0)
     layers: int | None = setting(
         None, "layers; with several, agents hear of others over layers x hops links; null: the model's own", ge=1
@@ -277,7 +262,7 @@ class BCConfig(ImitationConfig):
     cloning_steps: int = setting(1000, "steps that the expert flies", ge=1)
     cloning_updates: int = setting(6000, "updates on its rollouts, shared by the sizes", ge=1)
     models: Any = setting(
-        None, "models trained side by side on the same batches, a list; null: model.name", choices=MODEL_NAMES
+        None, "models trained side by side on the same batches, a list; null: model.name", choices=MODELS
     )
     hops: Any = setting(None, "numbers of hops of each of them, a list; null: model.hops", ge=0, whole=True)
     seeds: int = setting(1, "initial weights of each of them, trained side by side", ge=1)
@@ -551,7 +536,7 @@ class ReproduceConfig:
         None,
         "further models beside the paper's, your own too, a list: in the tables, and in range, faults and size; "
         "null: none",
-        choices=MODEL_NAMES,
+        choices=MODELS,
     )
     hops: Any = setting([1, 2, 3], "numbers of hops of these", ge=0, whole=True)
     folder: str | None = setting(

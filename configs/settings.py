@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from modgnn_rl.errors import InputError, suggestion
@@ -30,7 +30,7 @@ def setting(
     ge: float | None = None,
     gt: float | None = None,
     le: float | None = None,
-    choices: Sequence[Any] | None = None,
+    choices: Collection[Any] | None = None,
     whole: bool = False,
     length: int | None = None,
 ) -> Any:
@@ -42,7 +42,7 @@ def setting(
         ge: smallest legal value.
         gt: exclusive lower bound.
         le: largest legal value.
-        choices: the legal values, where they can be listed; a list may grow later.
+        choices: the legal values, where they can be listed; a registry (its names), which may grow later.
         whole: accept whole numbers and lists of them only; for settings that may be either.
         length: length of a list.
     """

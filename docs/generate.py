@@ -25,6 +25,7 @@ from omegaconf import MISSING
 
 import modgnn_rl
 from modgnn_rl.cli.help import FLAGS, legal_values
+from modgnn_rl.registry import MODELS
 
 PACKAGE = Path(modgnn_rl.__file__).parent
 CONFIGS = PACKAGE / "configs"
@@ -106,8 +107,9 @@ def groups_of(command: Command) -> dict[str, str]:
 
 
 def choices_of(group: str) -> list[str]:
-    """The choices of a group, in alphabetical order."""
-    return sorted(file.stem for file in (CONFIGS / group).glob("*.yaml"))
+    """The choices of a group, in alphabetical order; a registered model needs no YAML file."""
+    files = [file.stem for file in (CONFIGS / group).glob("*.yaml")]
+    return sorted({*files, *(MODELS if group == "model" else ())})
 
 
 def _defaults(name: str) -> list[Any]:
@@ -124,6 +126,8 @@ def preset_of(command: Command, group: str, choice: str) -> tuple[type | None, d
     typed = {f"/{key.replace('/', '_')}_schema@_here_": node for key, node in command.nodes.items()}
     kind: type | None = None
     values: dict[str, Any] = {}
+    if not (CONFIGS / group / f"{choice}.yaml").exists() and choice in choices_of(group):
+        return None, {"name": choice}
     for entry in _defaults(f"{group}/{choice}"):
         if entry in typed:
             kind = typed[entry]

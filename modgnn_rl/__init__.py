@@ -11,20 +11,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from modgnn_rl.deploy.agent import Agent
-    from modgnn_rl.models.registry import make_model, register_model
+    from modgnn_rl.models.factory import make_model
     from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
     from modgnn_rl.tracking.loading import load_policy
 
 __version__ = "0.1.0"
-__all__ = ["Agent", "ModGNN", "ModGNNLayer", "__version__", "load_policy", "make_model", "register_model"]
+__all__ = ["Agent", "ModGNN", "ModGNNLayer", "__version__", "load_policy", "make_model"]
 
 _HOMES = {
     "Agent": "modgnn_rl.deploy.agent",
     "ModGNN": "modgnn_rl.nn.modgnn",
     "ModGNNLayer": "modgnn_rl.nn.modgnn",
     "load_policy": "modgnn_rl.tracking.loading",
-    "make_model": "modgnn_rl.models.registry",
-    "register_model": "modgnn_rl.models.registry",
+    "make_model": "modgnn_rl.models.factory",
 }
 
 

@@ -53,6 +53,7 @@ from modgnn_rl.cli.help import children, fields, help_text
 from modgnn_rl.cli.overview import completion
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError, suggestion
+from modgnn_rl.registry import MODELS
 from modgnn_rl.utils.internals import parse_hydra_flags
 from modgnn_rl.utils.signals import Stopped
 
@@ -222,6 +223,8 @@ def _register(main: Callable[..., Any], schema: type, name: str, nodes: Mapping[
     store.store(name=f"{name}_schema", node=schema)
     for key, node in nodes.items():
         store.store(name=f"{key.replace('/', '_')}_schema", node=node)
+    for model in MODELS:  # model=<name> needs no YAML file
+        store.store(group="model", name=model, node={"name": model})
     quiet = {"hydra_logging": "none", "job_logging": "none"}
     defaults = [{**entry, **{key: quiet[key] for key in entry if key in quiet}} for entry in HydraConf().defaults]
     conf = HydraConf(

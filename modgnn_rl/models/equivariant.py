@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from modgnn_rl.models.blocks import VELOCITY_SCALE, LayerSpec, Zero, mlp
 from modgnn_rl.nn.modgnn import ModGNNLayer
+from modgnn_rl.registry import MODELS
 
 __all__ = [
     "SCALARS",
@@ -187,15 +188,7 @@ def _norm(vector: Tensor) -> Tensor:
 VECTORS, SCALARS = 4, 4  # the same of pair_force: 3 * 4 + 4 features
 
 
-def pair_force(spec: LayerSpec) -> ModGNNLayer:
-    """Equivariant forces of pairs as f_pre, summed over the neighbours: `PairForce`; hop 0 contributes nothing.
-
-    Layers before the last put out four vectors and four scalars, which later layers compare like velocities.
-    """
-    vectors, scalars = (VECTORS, SCALARS) if spec.head is None else (1, 0)
-    return _sum_of_forces(spec, vectors, scalars, features=(VECTORS, SCALARS))
-
-
+@MODELS.register("moment_force", layers=2)
 def moment_force(spec: LayerSpec) -> ModGNNLayer:
     """`pair_force` over what the neighbours' own neighbourhoods look like: `Moments` in the layers before the last.
 
@@ -206,6 +199,16 @@ def moment_force(spec: LayerSpec) -> ModGNNLayer:
         return _sum_of_forces(spec, 1, 0, features)
     f_pre = [Zero(3 * Moments.vectors + Moments.scalars), *(Moments(spec.earlier) for _ in range(spec.hops))]
     return ModGNNLayer(spec.hops, f_pre=f_pre, f_final=VectorSquash(Moments.vectors))
+
+
+@MODELS.register("pair_force")
+def pair_force(spec: LayerSpec) -> ModGNNLayer:
+    """Equivariant forces of pairs as f_pre, summed over the neighbours: `PairForce`; hop 0 contributes nothing.
+
+    Layers before the last put out four vectors and four scalars, which later layers compare like velocities.
+    """
+    vectors, scalars = (VECTORS, SCALARS) if spec.head is None else (1, 0)
+    return _sum_of_forces(spec, vectors, scalars, features=(VECTORS, SCALARS))
 
 
 def _sum_of_forces(spec: LayerSpec, vectors: int, scalars: int, features: tuple[int, int]) -> ModGNNLayer:

@@ -9,12 +9,14 @@ from torch import nn
 from modgnn_rl.models.blocks import LATENT, LayerSpec, Relative, Scale, mlp
 from modgnn_rl.nn.communication import GraphAttention, MessagePassing
 from modgnn_rl.nn.modgnn import ModGNNLayer
+from modgnn_rl.registry import MODELS
 
 __all__ = ["HEADS", "gat", "mpnn"]
 
 HEADS = 4  # of attention
 
 
+@MODELS.register("gat")
 def gat(spec: LayerSpec) -> ModGNNLayer:
     """Attention over the neighbours as f_com (GATv2): to differences in hop 1, to what hop 1 made of them after it."""
     heads = math.gcd(HEADS, spec.hidden)
@@ -25,6 +27,7 @@ def gat(spec: LayerSpec) -> ModGNNLayer:
     return _networks_of_hops(spec, f_com)
 
 
+@MODELS.register("mpnn")
 def mpnn(spec: LayerSpec) -> ModGNNLayer:
     """Message passing: a learned network of sender and receiver as f_com."""
     f_com: list[nn.Module] = []

@@ -9,10 +9,12 @@ from modgnn_rl.models.blocks import LATENT, LayerSpec, Scale, mlp
 from modgnn_rl.models.central import CentralLayer
 from modgnn_rl.nn.communication import Adjacency
 from modgnn_rl.nn.modgnn import ModGNNLayer
+from modgnn_rl.registry import MODELS
 
 __all__ = ["central", "gcn", "gcn_final", "modgnn_adjacency", "modgnn_mlp", "no_mid", "no_pre"]
 
 
+@MODELS.register("modgnn_mlp")
 def modgnn_mlp(spec: LayerSpec) -> ModGNNLayer:
     """ModGNN-MLP of the paper: three-layer networks for f_pre, f_mid (10 features out) and f_final, one a hop."""
     f_pre = [nn.Sequential(scale, mlp(spec.inputs, spec.hidden, LATENT)) for scale in spec.scales()]
@@ -21,6 +23,7 @@ def modgnn_mlp(spec: LayerSpec) -> ModGNNLayer:
     return ModGNNLayer(spec.hops, f_pre=f_pre, f_mid=f_mid, f_final=f_final)
 
 
+@MODELS.register("modgnn_adjacency")
 def modgnn_adjacency(spec: LayerSpec) -> ModGNNLayer:
     """ModGNN-MLP whose f_com is the adjacency: sums of the neighbours' data, not of differences, as in a plain GCN."""
     layer = modgnn_mlp(spec)
@@ -28,6 +31,7 @@ def modgnn_adjacency(spec: LayerSpec) -> ModGNNLayer:
     return layer
 
 
+@MODELS.register("no_pre")
 def no_pre(spec: LayerSpec) -> ModGNNLayer:
     """ModGNN-MLP without f_pre: the neighbours' data are summed before any network sees them."""
     f_mid = [mlp(spec.inputs, spec.hidden, LATENT) for _ in range(spec.hops + 1)]
@@ -35,12 +39,14 @@ def no_pre(spec: LayerSpec) -> ModGNNLayer:
     return ModGNNLayer(spec.hops, f_pre=spec.scales(), f_mid=f_mid, f_final=f_final)
 
 
+@MODELS.register("no_mid")
 def no_mid(spec: LayerSpec) -> ModGNNLayer:
     """ModGNN-MLP without f_mid: the hops are summed as they come out of f_pre."""
     f_pre = [nn.Sequential(scale, mlp(spec.inputs, spec.hidden, LATENT)) for scale in spec.scales()]
     return ModGNNLayer(spec.hops, f_pre=f_pre, f_final=spec.end(mlp(LATENT, spec.hidden, spec.outputs)))
 
 
+@MODELS.register("gcn")
 def gcn(spec: LayerSpec) -> ModGNNLayer:
     """A GCN: a matrix for each hop as f_mid, no f_pre, a pointwise f_final (the head); ``hidden`` is not used."""
     f_mid = [nn.Linear(spec.inputs, spec.outputs, bias=hop == 0) for hop in range(spec.hops + 1)]
@@ -48,6 +54,7 @@ def gcn(spec: LayerSpec) -> ModGNNLayer:
     return ModGNNLayer(spec.hops, f_pre=spec.scales(), f_mid=f_mid, f_final=f_final)
 
 
+@MODELS.register("gcn_final")
 def gcn_final(spec: LayerSpec) -> ModGNNLayer:
     """GCN + f_final of the paper: a matrix for each hop, then a three-layer network in place of the activation."""
     f_mid = [nn.Linear(spec.inputs, LATENT, bias=hop == 0) for hop in range(spec.hops + 1)]
@@ -55,6 +62,7 @@ def gcn_final(spec: LayerSpec) -> ModGNNLayer:
     return ModGNNLayer(spec.hops, f_pre=spec.scales(), f_mid=f_mid, f_final=f_final)
 
 
+@MODELS.register("central")
 def central(spec: LayerSpec) -> CentralLayer:
     """The paper's centralised baseline: four linear layers from all observations to all actions, for one N only."""
     if spec.num_agents is None:

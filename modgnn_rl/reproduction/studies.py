@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig, ScaleConfig, as_list
-from modgnn_rl.models.registry import make_model
+from modgnn_rl.models.factory import make_model
 
 __all__ = ["FAULTS", "HOPS", "Study", "Subject", "World", "equal_hidden", "fault_name", "study_of"]
 

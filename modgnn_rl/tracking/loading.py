@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
-from modgnn_rl.models.registry import configured_model
+from modgnn_rl.models.factory import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder

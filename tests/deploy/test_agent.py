@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from modgnn_rl import Agent, ModGNN, ModGNNLayer, make_model
 from modgnn_rl.deploy.agent import LinkData, step
 from modgnn_rl.errors import InputError
-from modgnn_rl.models.registry import MODELS
 from modgnn_rl.nn.communication import (
     Adjacency,
     CoordinateFrame,
@@ -26,6 +25,7 @@ from modgnn_rl.nn.communication import (
     NormalizedAdjacency,
 )
 from modgnn_rl.nn.graph import AGGREGATIONS
+from modgnn_rl.registry import MODELS
 
 AGENTS, FEATURES, WIDTH, LINK_FEATURES, STEPS = 4, 6, 4, 2, 6
 LOCAL_STARTS = ("mask", "zero")

@@ -31,8 +31,8 @@ from modgnn_rl.deploy.export import Exported, export_agent
 from modgnn_rl.deploy.onnx_agent import AgentError, OnnxAgent
 from modgnn_rl.errors import InputError
 from modgnn_rl.export import main
-from modgnn_rl.models.registry import MODELS
 from modgnn_rl.nn.communication import GraphAttention, MessagePassing
+from modgnn_rl.registry import MODELS
 from modgnn_rl.tracking.checkpoint import save_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 

@@ -18,7 +18,7 @@ from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.parallel import ParallelFlocks, parallel_flocks
 from modgnn_rl.errors import InputError
-from modgnn_rl.models.registry import make_model
+from modgnn_rl.models.factory import make_model
 from modgnn_rl.utils.seeds import derive_seed
 
 WORKERS, FLOCKS, AGENTS = 2, 2, 3

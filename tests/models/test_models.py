@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,6 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import (
-    MODEL_NAMES,
-    MODEL_PLUGINS,
     DAggerConfig,
     EvaluationConfig,
     FlockingConfig,
@@ -29,9 +26,10 @@ from modgnn_rl.configs.schema import (
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import train
 from modgnn_rl.models.blocks import BallHead, LayerSpec, Scale
-from modgnn_rl.models.equivariant import VectorSquash
-from modgnn_rl.models.registry import MODELS, PairForce, configured_model, make_model, register_model
+from modgnn_rl.models.equivariant import PairForce, VectorSquash
+from modgnn_rl.models.factory import configured_model, make_model
 from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
+from modgnn_rl.registry import MODELS
 
 seeds = st.integers(0, 999)
 local_models = pytest.mark.parametrize("name", [name for name in MODELS if name != "central"])
@@ -191,8 +189,8 @@ def test_the_table_of_models_in_the_documentation_is_true() -> None:
         assert [f"{model.num_parameters:,}" for model in models] == counts, name
 
 
-def test_names_in_the_settings_are_the_models() -> None:
-    assert list(MODELS) == MODEL_NAMES
+def test_the_default_model_is_listed_first() -> None:
+    assert next(iter(MODELS)) == ModelConfig().name
 
 
 def shared_hops(spec: LayerSpec) -> ModGNNLayer:
@@ -200,17 +198,14 @@ def shared_hops(spec: LayerSpec) -> ModGNNLayer:
 
 
 @pytest.fixture
-def own_names() -> Iterator[None]:
-    names = list(MODEL_NAMES)
-    yield
-    for name in set(MODEL_NAMES) - set(names):
-        MODELS.pop(name)
-    MODEL_NAMES[:] = names
+def clean_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget what a test registers."""
+    monkeypatch.setattr(MODELS, "_added", dict(MODELS._added))
 
 
-def test_a_model_of_ones_own_is_trained_and_loaded_by_its_name(own_names: None, tmp_path: Path) -> None:
-    register_model("shared_hops", shared_hops)
-    register_model("shared_hops", shared_hops)  # as a cell of a notebook that is run again
+def test_a_registered_model_is_trained_and_loaded_by_its_name(clean_registry: None, tmp_path: Path) -> None:
+    MODELS.register("shared_hops")(shared_hops)
+    MODELS.register("shared_hops")(shared_hops)  # as when a notebook cell is run again
     assert make_model("shared_hops", hops=3).num_parameters == make_model("shared_hops").num_parameters
     run = train(
         TrainConfig(
@@ -222,15 +217,21 @@ def test_a_model_of_ones_own_is_trained_and_loaded_by_its_name(own_names: None, 
         )
     )
     assert load_policy(run.path).layers[0].hops == 1
-    with pytest.raises(InputError, match="model 'gcn' is built in; give your own another name"):
-        register_model("gcn", shared_hops)
+    with pytest.raises(InputError, match="model 'gcn' is built in; choose another name"):
+        MODELS.register("gcn")(shared_hops)
 
 
-def test_an_installed_package_brings_models(own_names: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = EntryPoint("plugged", "modgnn_rl.models.paper:gcn", MODEL_PLUGINS)
-    monkeypatch.setattr("modgnn_rl.models.registry.entry_points", lambda **_: EntryPoints([entry]))
+def test_the_number_of_layers_may_be_registered_with_a_model(clean_registry: None) -> None:
+    MODELS.register("two_layers", layers=2)(shared_hops)
+    assert [len(make_model("two_layers", hops=0, layers=layers).layers) for layers in (None, 1)] == [2, 1]
+    assert len(make_model("moment_force").layers) == 2
+
+
+def test_an_installed_package_provides_models(clean_registry: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = EntryPoint("plugged", "modgnn_rl.models.paper:gcn", "modgnn_rl.models")
+    monkeypatch.setattr("modgnn_rl.registry.entry_points", lambda **_: EntryPoints([entry]))
     assert make_model("plugged", seed=0).state_dict().keys() == make_model("gcn").state_dict().keys()
-    assert "plugged" in MODEL_NAMES
+    assert "plugged" in MODELS.names()
 
 
 @torch.no_grad()
@@ -302,7 +303,7 @@ def test_central_serves_one_number_of_agents_and_says_so() -> None:
         make_model("central")
     with pytest.raises(InputError, match="one layer"):
         build("central", layers=2)
-    with pytest.raises(InputError, match=r"one number of agents, and env.num_agents=\[8, 16\] asks for more"):
+    with pytest.raises(InputError, match=r"works for one number of agents, but env.num_agents=\[8, 16\] has several"):
         configured_model(ModelConfig(name="central"), FlockingConfig(num_agents=[8, 16]), seed=0)
 
 

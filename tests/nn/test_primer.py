@@ -20,7 +20,7 @@ from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import LocalReynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.models.registry import make_model
+from modgnn_rl.models.factory import make_model
 from modgnn_rl.nn.primer import RecurrentStatePrimer, missing
 
 FLOCKS, AGENTS = 3, 4

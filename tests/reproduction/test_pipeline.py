@@ -209,7 +209,7 @@ def test_a_claim_is_reversed_undecided_or_not_measured():
 
 
 def test_studies_at_equal_parameters_have_equal_parameters():
-    from modgnn_rl.models.registry import make_model
+    from modgnn_rl.models.factory import make_model
 
     def size(subject):
         model = make_model(subject.model, subject.hops, subject.hidden, layers=subject.layers, seed=0)

@@ -18,7 +18,7 @@ from modgnn_rl.configs.schema import (
 from modgnn_rl.data.dataset import EpisodeDataset
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
-from modgnn_rl.models.registry import configured_model
+from modgnn_rl.models.factory import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.loading import load_policy, stored_model
 from modgnn_rl.tracking.run_folder import RunFolder

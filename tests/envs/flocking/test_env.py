@@ -22,7 +22,7 @@ from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
 from modgnn_rl.envs.flocking.leader import NoiseLeader
 from modgnn_rl.envs.flocking.rewards import flocking_costs, flocking_reward, reward_weights
 from modgnn_rl.errors import InputError
-from modgnn_rl.models.registry import make_model
+from modgnn_rl.models.factory import make_model
 from modgnn_rl.nn.topology import as_matrix
 from modgnn_rl.utils.tensors import pair_distances
 

@@ -14,7 +14,7 @@ from torchrl.envs.utils import check_env_specs
 
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
-from modgnn_rl.models.registry import make_model
+from modgnn_rl.models.factory import make_model
 
 FAULTS: dict[str, dict[str, Any]] = {
     "message_loss": {"message_loss": 0.3},
