@@ -54,9 +54,11 @@ copybutton_exclude = ".linenos, .gp, .go"
 def setup(app: Any) -> None:
     """Make the pages that are generated, and mend what Sphinx reads otherwise than GitHub does."""
     sys.path.insert(0, str(DOCS))
-    from generate import write_reference
+    from api import api_pages
+    from generate import reference_pages, root_pages, write_pages
 
-    app.connect("builder-inited", lambda app: write_reference(DOCS / "reference"))
+    app.connect("builder-inited", lambda app: write_pages(DOCS / "reference", reference_pages() | root_pages()))
+    app.connect("builder-inited", lambda app: write_pages(DOCS / "reference" / "api", api_pages()))
     app.connect("source-read", mend_links)
     app.connect("autodoc-process-signature", signature_of_init)
     app.connect("autodoc-process-docstring", escape_shapes, priority=400)  # before napoleon

@@ -1,7 +1,7 @@
 """The pages that are made from the configuration itself: every command, every choice, every setting.
 
-``docs/conf.py`` calls `write_reference` whenever the site is built. A command is whatever has a YAML file at the top of
-``configs/``; what it is made of is what it declares to `modgnn_rl.cli.command.run_command`.
+``docs/conf.py`` writes them with `write_pages` whenever the site is built. A command is whatever has a YAML file at the top
+of ``configs/``; what it is made of is what it declares to `modgnn_rl.cli.command.run_command`.
 """
 
 from __future__ import annotations
@@ -73,10 +73,13 @@ def commands() -> list[Command]:
     return found
 
 
-def write_reference(folder: Path) -> None:
-    """Write the pages into a folder, those that changed."""
-    folder.mkdir(exist_ok=True)
-    for name, text in (reference_pages() | root_pages()).items():
+def write_pages(folder: Path, pages: Mapping[str, str]) -> None:
+    """Write pages into a folder, those that changed, and remove those that are no longer there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for page in folder.glob("*.md"):
+        if page.name not in pages:
+            page.unlink()
+    for name, text in pages.items():
         page = folder / name
         if not page.exists() or page.read_text(encoding="utf-8") != text:
             page.write_text(text, encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import pkgutil
 import re
 import shlex
 import sys
@@ -19,6 +20,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+import modgnn_rl
 from modgnn_rl.configs import schema
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
@@ -72,13 +74,16 @@ def commands() -> list[str]:
     return list(found)
 
 
-def test_every_public_module_is_on_a_page_of_the_api() -> None:
-    folders = {"modgnn_rl": "modgnn_rl", "envs": "modgnn_rl.envs", "trainers": "modgnn_rl.trainers"}
-    modules = {f"{package}.{file.stem}" for folder, package in folders.items() for file in (ROOT / folder).glob("*.py")}
-    text = "\n".join(page.read_text(encoding="utf-8") for page in (DOCS / "api").glob("*.md"))
-    shown = re.findall(r"^\.\. automodule:: (.*)$", text, re.MULTILINE)
-    assert len(shown) == len(set(shown))
-    assert {module for module in modules if not module.endswith("__")} <= set(shown)
+def test_every_module_is_on_a_page_of_the_api(scripts: Callable[[str], ModuleType]) -> None:
+    found = pkgutil.walk_packages(modgnn_rl.__path__, "modgnn_rl.")
+    modules = [
+        module.name for module in found if not module.ispkg and not module.name.rpartition(".")[2].startswith("_")
+    ]
+    pages = scripts("api").api_pages()
+    shown = re.findall(r"^\.\. automodule:: (.*)$", "\n".join(pages.values()), re.MULTILINE)
+    assert sorted(shown) == sorted(modules)
+    linked = re.findall(r"\]\((.*?\.md)\)", pages["index.md"])
+    assert sorted([*linked, "index.md"]) == sorted(pages)
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
