@@ -1,7 +1,7 @@
 """The pages that are made from the configuration itself: every command, every choice, every setting.
 
-``docs/conf.py`` writes them with `write_pages` whenever the site is built. A command is whatever has a YAML file at the top
-of ``configs/``; what it is made of is what it declares to `modgnn_rl.cli.command.run_command`.
+``docs/conf.py`` writes them with `write_pages` whenever the site is built. A command is whatever has a YAML file
+at the top of ``configs/``; what it is made of is what it declares to `modgnn_rl.cli.command.run_command`.
 """
 
 from __future__ import annotations
