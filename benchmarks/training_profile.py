@@ -15,7 +15,7 @@ import numpy as np
 
 from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import TrainConfig
-from modgnn_rl.experiment.resume import TRAINER_SETTINGS
+from modgnn_rl.registry import TRAINERS
 
 WHOLE = ("forward", "logging", "logging: reference rollouts, once")
 
@@ -63,7 +63,6 @@ def watched() -> Clock:
 
     from modgnn_rl.envs import FlockingEnv
     from modgnn_rl.envs.flocking.expert import Reynolds
-    from modgnn_rl.experiment import training
     from modgnn_rl.nn.modgnn import ModGNN
     from modgnn_rl.trainers.collectors.flocks import FlockBuffer
     from modgnn_rl.trainers.collectors.local import FlockCollector
@@ -91,7 +90,6 @@ def watched() -> Clock:
     clock.watch(DashboardCallback, "on_start", "logging: reference rollouts, once")
     clock.watch(TrainingLoop, "_save", "checkpoints")
     clock.watch(TrainingLoop, "_save_best", "checkpoints")
-    training.evaluate_policies = lambda *_, **__: {}  # it comes after the training
     return clock
 
 
@@ -100,7 +98,7 @@ def main(config: TrainConfig) -> None:
     from modgnn_rl.experiment.training import train
 
     clock = watched()
-    train(config)
+    train(config, evaluate=False)
     total = np.sum(list(clock.seconds.values()), axis=0)
     print("\n| part | clock, s | share | processor, s | share |\n|---|---:|---:|---:|---:|")
     for part, seconds in sorted([*clock.seconds.items(), ("all", total)], key=lambda entry: -entry[1][1]):
@@ -109,4 +107,9 @@ def main(config: TrainConfig) -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, TrainConfig, "train", nodes={f"trainer/{name}": kind for name, kind in TRAINER_SETTINGS.items()})
+    run_command(
+        main,
+        TrainConfig,
+        "train",
+        nodes={f"trainer/{name}": entry.option("settings") for name, entry in TRAINERS.items()},
+    )

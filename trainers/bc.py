@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import ReplayBuffer
 
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
 from modgnn_rl.data.dataset import EpisodeDataset
+from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.tracking.checkpoint import save_checkpoint
-from modgnn_rl.tracking.run_folder import RunFolder
+from modgnn_rl.registry import TRAINERS
 from modgnn_rl.trainers.collectors.flocks import FlockBuffer, make_buffers, make_validation_buffers, named_buffers
-from modgnn_rl.trainers.common import distributed
-from modgnn_rl.trainers.imitation.learner import ImitationLearner, fit_together, validate_together
+from modgnn_rl.trainers.collectors.windows import window_of
+from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
+from modgnn_rl.trainers.imitation.side_by_side import by_policy, member_configs, member_folders
 from modgnn_rl.trainers.loop.context import TrainContext
-from modgnn_rl.trainers.loop.setup import DART_PARTS, make_learner, side_by_side
+from modgnn_rl.trainers.loop.setup import check_steps, check_updates, make_learner
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 from modgnn_rl.utils.seeds import derive_seed
 
@@ -31,8 +30,31 @@ ROUNDS = 40  # parts of the training at least, after each of which the loss is l
 ROUND_UPDATES = 150  # updates of such a part at most: what a signal may have to wait for
 FLIGHT_ROUNDS = 20  # parts after which the policies fly
 FLIGHT_STEPS = 250  # how long
+DART_PARTS = 4  # parts of the rollouts between which the noise is set anew
 
 
+def check_bc(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDictModuleBase | None) -> None:
+    """Refuse too few updates, rollouts that are too short, and a dataset that is damaged or does not fit."""
+    settings: BCConfig = config.trainer
+    check_updates(config, "cloning_updates")
+    if settings.dataset is None:
+        parts = DART_PARTS if settings.dart else 1
+        check_steps(config, "cloning_steps", parts * window_of(policies, settings))
+        return
+    if expert is not None:
+        raise InputError(
+            "trainer.dataset holds the labels of Reynolds flocking, not those of your expert; leave one out"
+        )
+    dataset = EpisodeDataset.open(settings.dataset)
+    dataset.check_world(config.env)
+    if dataset.episodes <= settings.num_val_envs:
+        raise InputError(
+            f"trainer.num_val_envs={settings.num_val_envs} leaves nothing to train on of the {dataset.episodes} "
+            f"episodes in {settings.dataset}; lower it, or collect more"
+        )
+
+
+@TRAINERS.register("bc", settings=BCConfig, objective="validation_loss", members=member_configs, check=check_bc)
 def bc(context: TrainContext) -> dict[str, ModGNN]:
     """Train policies by behaviour cloning, one or several side by side on the same batches.
 
@@ -53,7 +75,7 @@ def bc(context: TrainContext) -> dict[str, ModGNN]:
     rounds = min(each, max(ROUNDS, math.ceil(settings.cloning_updates / ROUND_UPDATES)))
     fitting = each // rounds
     updates = rounds * fitting * len(sizes)
-    members = side_by_side(config)
+    members = member_configs(config)
     by_name = {name: make_learner(member, (updates, updates)) for name, member in members.items()}
     learners, policies = list(by_name.values()), [learner.ema_policy for learner in by_name.values()]
     parts = DART_PARTS if settings.dart else 1
@@ -63,7 +85,7 @@ def bc(context: TrainContext) -> dict[str, ModGNN]:
     flights_at = [part * rounds // parts for part in range(parts)]
 
     with (
-        _own_folders(context.run, members, by_name),
+        member_folders(context.run, members, by_name),
         TrainingLoop(context, by_name, named_buffers(training, held_out), updates) as loop,
     ):
         buffers = {size: group.buffer for size, group in training.items()}
@@ -88,7 +110,7 @@ def bc(context: TrainContext) -> dict[str, ModGNN]:
                     "validation_loss": validate_together(learners, unseen),
                 }
                 for name, values in found.items():
-                    metrics |= _named(by_name, f"{size}/{name}", values)
+                    metrics |= by_policy(list(by_name), f"{size}/{name}", values)
                 for name, value in zip(by_name, found["validation_loss"], strict=True):
                     losses[name].append(value)
                 metrics[f"{size}/states"] = len(buffer)
@@ -100,34 +122,6 @@ def bc(context: TrainContext) -> dict[str, ModGNN]:
             loop.log(metrics, fitting * len(sizes), scores, validation_loss=metrics["validation_loss"])
 
     return dict(zip(by_name, policies, strict=True))
-
-
-@contextlib.contextmanager
-def _own_folders(
-    run: RunFolder, members: Mapping[str, TrainConfig], by_name: Mapping[str, ImitationLearner]
-) -> Iterator[None]:
-    """At the end, after Ctrl-C too, give each of several policies a run folder of its own inside the run's."""
-
-    def write() -> None:
-        for name, member in members.items() if len(members) > 1 and distributed.is_first() else ():
-            own = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
-            learner = by_name[name]
-            if learner.updates_done:  # a run stopped before it went on leaves what it had
-                save_checkpoint(own.checkpoints, learner.updates_done, {"policy": learner.ema_policy.state_dict()}, {})
-
-    try:
-        yield
-    except KeyboardInterrupt:
-        write()
-        raise
-    write()
-
-
-def _named(by_name: dict[str, Any], metric: str, values: Sequence[float]) -> dict[str, float]:
-    """One metric of each policy; if there are several, it begins with the policy's name."""
-    if len(by_name) == 1:
-        return {metric: values[0]}
-    return {f"{name}/{metric}": value for name, value in zip(by_name, values, strict=True)}
 
 
 def _errors_in_flight(
@@ -148,7 +142,7 @@ def _errors_in_flight(
         )
         for learner in by_name.values()
     ]
-    return _named(by_name, f"{size}/error", [float(rollout.error.mean()) for rollout in rollouts])
+    return by_policy(list(by_name), f"{size}/error", [float(rollout.error.mean()) for rollout in rollouts])
 
 
 def _share(settings: BCConfig, unseen: FlockBuffer, window: int) -> ReplayBuffer:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
-from modgnn_rl.configs.schema import DAggerConfig
+from tensordict.nn import TensorDictModuleBase
+
+from modgnn_rl.configs.schema import DAggerConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.registry import TRAINERS
 from modgnn_rl.trainers.collectors.behaviour import SafetyGate, beta_schedule, disagreement, ensemble_std
 from modgnn_rl.trainers.collectors.flocks import make_buffers, make_validation_buffers, named_buffers
+from modgnn_rl.trainers.collectors.windows import window_of
 from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
 from modgnn_rl.trainers.loop.callbacks import StopOnPlateau
 from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.trainers.loop.metrics import rollout_metrics
-from modgnn_rl.trainers.loop.setup import make_learner
+from modgnn_rl.trainers.loop.setup import check_steps, check_updates, make_learner
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 
 __all__ = ["dagger"]
@@ -22,6 +27,21 @@ __all__ = ["dagger"]
 GATES = {"disagreement": disagreement, "ensemble": ensemble_std}
 
 
+def ensemble(config: TrainConfig) -> dict[str, TrainConfig]:
+    """The settings of each policy that DAgger trains, by name: one, or with ``gate=ensemble`` several."""
+    settings: DAggerConfig = config.trainer
+    others = range(1, settings.ensemble if settings.gate == "ensemble" else 1)
+    return dict.fromkeys([config.model.name, *(f"ensemble_{number}" for number in others)], config)
+
+
+def check_dagger(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDictModuleBase | None) -> None:
+    """Refuse too few updates and rollouts that are too short."""
+    check_updates(config, "cloning_updates")
+    check_updates(config, "updates_per_round")
+    check_steps(config, "steps_per_round", window_of(policies, config.trainer))
+
+
+@TRAINERS.register("dagger", settings=DAggerConfig, objective="error", members=ensemble, check=check_dagger)
 def dagger(context: TrainContext) -> dict[str, ModGNN]:
     """Train a policy with DAgger.
 
@@ -41,8 +61,8 @@ def dagger(context: TrainContext) -> dict[str, ModGNN]:
     cloning = settings.cloning_updates // len(sizes)
     fitting = settings.updates_per_round // len(sizes)
     updates = (cloning + settings.rounds * fitting) * len(sizes)
-    members = settings.ensemble if settings.gate == "ensemble" else 1
-    learners = [make_learner(config, (cloning * len(sizes), updates), member) for member in range(members)]
+    names = list(ensemble(config))
+    learners = [make_learner(config, (cloning * len(sizes), updates), member) for member in range(len(names))]
     cloning_stretches = math.ceil(settings.cloning_steps / settings.steps_per_round)
     gate = None if settings.gate == "none" else SafetyGate(GATES[settings.gate], settings.gate_threshold)
     policies, expert = [learner.ema_policy for learner in learners], context.expert
@@ -53,7 +73,6 @@ def dagger(context: TrainContext) -> dict[str, ModGNN]:
         plateau = StopOnPlateau(settings.plateau_rounds, settings.plateau_gain, after=settings.beta_rounds)
         context = dataclasses.replace(context, callbacks=[*context.callbacks, plateau])
 
-    names = [config.model.name, *(f"ensemble_{member}" for member in range(1, members))]
     by_name = dict(zip(names, learners, strict=True))
     with TrainingLoop(context, by_name, named_buffers(flocks, held_out), updates) as loop:
         for index in loop.rounds(0, settings.rounds):

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-from modgnn_rl.configs.schema import MAPPOConfig
+from collections.abc import Sequence
+
+from tensordict.nn import TensorDictModuleBase
+
+from modgnn_rl.configs.schema import MAPPOConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.registry import TRAINERS
 from modgnn_rl.trainers.collectors.flocks import flocks_of, named_buffers
 from modgnn_rl.trainers.collectors.local import make_collector
 from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.trainers.loop.metrics import reward_metrics, rollout_metrics
-from modgnn_rl.trainers.loop.setup import initial_policy
+from modgnn_rl.trainers.loop.setup import check_steps, initial_policy
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
-from modgnn_rl.trainers.ppo.learner import PPOLearner
+from modgnn_rl.trainers.ppo.learner import PPOLearner, ppo_window
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["mappo"]
 
 
+def check_mappo(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDictModuleBase | None) -> None:
+    """Refuse rollouts that are too short."""
+    check_steps(config, "steps_per_round", ppo_window(policies[0], config.trainer)[1])
+
+
+@TRAINERS.register("mappo", settings=MAPPOConfig, objective="reward", check=check_mappo)
 def mappo(context: TrainContext) -> dict[str, ModGNN]:
     """Improve a policy by MAPPO, from a cloned one (``config.init_from``) or from scratch.
 

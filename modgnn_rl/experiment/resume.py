@@ -10,21 +10,19 @@ from typing import Any, cast
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, MAPPOConfig, TrainConfig
+from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.configs.settings import flat
 from modgnn_rl.errors import InputError
+from modgnn_rl.registry import TRAINERS
 from modgnn_rl.tracking.run_folder import RunFolder
 
 __all__ = [
-    "TRAINER_SETTINGS",
     "changed_config",
     "differences",
     "requires_restart",
     "stored_config",
     "with_stored_trainer",
 ]
-
-TRAINER_SETTINGS: dict[str, type] = {"bc": BCConfig, "dagger": DAggerConfig, "mappo": MAPPOConfig}
 
 # What the weights, or what has been drawn, were made for.
 FIXED = (
@@ -63,10 +61,10 @@ def stored_config(run: RunFolder) -> TrainConfig:
         InputError: they are not as this version writes them.
     """
     try:
-        trainer = TRAINER_SETTINGS[run.config["trainer"]["name"]]()
+        trainer = TRAINERS[run.config["trainer"]["name"]].option("settings")()
         structure = OmegaConf.structured(TrainConfig(trainer=trainer))
         return cast(TrainConfig, OmegaConf.to_object(OmegaConf.merge(structure, run.config)))
-    except (KeyError, TypeError, OmegaConfBaseException) as error:
+    except (InputError, KeyError, TypeError, OmegaConfBaseException) as error:
         raise InputError(
             f"{run.path / 'config.yaml'} is not as this version writes it ({str(error).splitlines()[0]}): resume the "
             "run with the version that began it"

@@ -15,30 +15,30 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import TrainConfig, as_list
 from modgnn_rl.configs.settings import check
-from modgnn_rl.errors import InputError, one_line
+from modgnn_rl.errors import one_line
 from modgnn_rl.experiment.evaluate import evaluate_policies
 from modgnn_rl.experiment.resume import changed_config, differences, requires_restart, stored_config
+from modgnn_rl.registry import TRAINERS
 from modgnn_rl.tracking.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.tracking.loggers import LoggerGroup, check_logger, make_logger
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.bc import bc
 from modgnn_rl.trainers.common import distributed
-from modgnn_rl.trainers.dagger import dagger
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.trainers.loop.dashboard_callback import DashboardCallback, log_evaluation
 from modgnn_rl.trainers.loop.setup import check_training, resolve_model
-from modgnn_rl.trainers.mappo import mappo
 from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.utils.signals import GracefulInterrupt
 
-__all__ = ["TRAINERS", "resume", "train"]
-
-TRAINERS = {"bc": bc, "dagger": dagger, "mappo": mappo}
+__all__ = ["resume", "train"]
 
 
 def train(
-    config: TrainConfig, *, expert: TensorDictModuleBase | None = None, callbacks: Sequence[Callback] = ()
+    config: TrainConfig,
+    *,
+    expert: TensorDictModuleBase | None = None,
+    callbacks: Sequence[Callback] = (),
+    evaluate: bool = True,
 ) -> RunFolder:
     """Train a policy, evaluate it, and leave everything in a new run folder.
 
@@ -51,6 +51,7 @@ def train(
         expert: whom to learn from: any TensorDictModule that reads the environment's keys and writes
             ``("agents", "expert_action")``; default: Reynolds flocking. Errors in the evaluation are against it too.
         callbacks: people's own code, see `modgnn_rl.trainers.loop.callbacks`.
+        evaluate: whether to evaluate the policies at the end.
 
     Raises:
         InputError: a bad setting, or a device or a logger that this machine does not have; nothing is created then.
@@ -60,7 +61,7 @@ def train(
         run = _new_run(config)
         with _lock(run):
             distributed.print_rank0(f"Training in {run.path}")
-            return _work(config, run, expert, callbacks)
+            return _work(config, run, expert, callbacks, evaluate=evaluate)
 
 
 def resume(
@@ -69,6 +70,7 @@ def resume(
     *,
     expert: TensorDictModuleBase | None = None,
     callbacks: Sequence[Callback] = (),
+    evaluate: bool = True,
 ) -> RunFolder:
     """Go on with a run that was stopped, killed, or ended, from its last checkpoint.
 
@@ -82,6 +84,7 @@ def resume(
             begin anew, with no data.
         expert: as `train` was given it.
         callbacks: as `train` was given them; they begin with what checkpoints hold of them.
+        evaluate: whether to evaluate the policies at the end.
 
     Raises:
         InputError: no run, no readable checkpoint, a change that cannot be, or a run that goes on elsewhere.
@@ -104,7 +107,7 @@ def resume(
             distributed.print_rank0(
                 "Flocks begin anew, with no data, in all processes but the first, whose flocks are kept"
             )
-        return _work(config, run, expert, callbacks, checkpoint, keeps_flocks=not anew)
+        return _work(config, run, expert, callbacks, checkpoint, keeps_flocks=not anew, evaluate=evaluate)
 
 
 def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainConfig:
@@ -113,11 +116,7 @@ def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainC
     prepare_torch(distributed.own_device(config.device), config.threads)
     check_logger(config)
     config = resolve_model(config)
-    check_training(config)
-    if expert is not None and getattr(config.trainer, "dataset", None):
-        raise InputError(
-            "trainer.dataset holds the labels of Reynolds flocking, not those of your expert; leave one out"
-        )
+    check_training(config, expert)
     return config
 
 
@@ -144,6 +143,7 @@ def _work(
     checkpoint: Checkpoint | None = None,
     *,
     keeps_flocks: bool = True,
+    evaluate: bool,
 ) -> RunFolder:
     """Train from the beginning or from a checkpoint, then evaluate, which the first process does alone."""
     first = distributed.is_first()
@@ -156,15 +156,16 @@ def _work(
             own, run, loggers, expert, [*callbacks, *watches], checkpoint, keeps_flocks, interruption
         )
         try:
-            policies = TRAINERS[config.trainer.name](context)
+            policies = TRAINERS[config.trainer.name].load()(context)
             distributed.leave()
             if not first:
                 return run
-            run.note_status("evaluating")
-            sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
-            env_config, settings, device = config.env, config.evaluation, own.device
-            tables = evaluate_policies(run, policies, env_config, settings, sizes, device, expert=expert)
-            log_evaluation(loggers, tables)
+            if evaluate:
+                run.note_status("evaluating")
+                sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
+                env_config, settings, device = config.env, config.evaluation, own.device
+                tables = evaluate_policies(run, policies, env_config, settings, sizes, device, expert=expert)
+                log_evaluation(loggers, tables)
             run.note_status("finished")
         except BaseException as error:
             if first:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from modgnn_rl.configs.schema import as_list
+from modgnn_rl.registry import TRAINERS
 from modgnn_rl.tracking.reader import (
     as_dict,
     as_number,
@@ -28,7 +29,6 @@ from modgnn_rl.tracking.run_folder import RunFolder
 __all__ = ["METRICS", "RunSummary", "find_runs", "summarise_run"]
 
 METRICS = ("error", "reward", "validation_loss", "loss")
-AIMS = {"bc": "validation_loss", "dagger": "error", "mappo": "reward"}  # what the best policy is the best in
 RECENT = 5  # numbers that are averaged
 DEPTH = 3  # folders, for sweeps and groups of runs
 
@@ -118,7 +118,8 @@ def summarise_run(path: Path, name: str | None = None) -> RunSummary:
         return RunSummary(name, path, path, problem=str(error))
     run = RunFolder(path, config)
     records = last_records(run.metrics_file)
-    aim = AIMS.get(str(as_dict(config.get("trainer")).get("name")), "")
+    trainer = str(as_dict(config.get("trainer")).get("name"))
+    aim = TRAINERS[trainer].option("objective", "") if trainer in TRAINERS else ""
     summary = RunSummary(name, path, path, config=config, aim=aim, **_standing(run, records))
     policies = _policies(records[-1]) if records else []
     return dataclasses.replace(

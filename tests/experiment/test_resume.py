@@ -20,7 +20,6 @@ from modgnn_rl.configs.schema import (
     TrainConfig,
 )
 from modgnn_rl.errors import InputError
-from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
@@ -72,11 +71,6 @@ RUNS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _without_evaluation(monkeypatch):
-    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
-
-
 class Signal(Callback):
     """Sends a signal to this process in one round."""
 
@@ -98,7 +92,7 @@ def _config(runs, **settings) -> TrainConfig:
 def _stop(runs, at=2, number=signal.SIGTERM, **settings):
     """A run that was stopped in a round."""
     with pytest.raises(Stopped) as stopped:
-        train(_config(runs, **settings), callbacks=[Signal(at, number)])
+        train(_config(runs, **settings), callbacks=[Signal(at, number)], evaluate=False)
     assert stopped.value.code == 128 + number
     (folder,) = runs.iterdir()
     return RunFolder.open(folder)
@@ -131,10 +125,10 @@ QUICK = {"dagger with a reservoir, stored messages, a plateau", "mappo"}
 )
 def test_a_stopped_run_ends_as_one_that_was_not(tmp_path, name):
     settings = RUNS[name]
-    straight = train(_config(tmp_path / "straight", **settings))
+    straight = train(_config(tmp_path / "straight", **settings), evaluate=False)
     run = _stop(tmp_path / "stopped", at=1 if name.startswith("bc") else 2, **settings)
     assert run.state == "stopped"
-    resume(run.path)
+    resume(run.path, evaluate=False)
     assert run.state == "finished"
     _assert_equal(_all_of(straight), _all_of(run))
 
@@ -144,7 +138,7 @@ def test_flocks_or_data_that_begin_anew(tmp_path, capsys, how):
     kept = how == "another number of agents"
     run = _stop(tmp_path, trainer=DAggerConfig(**DAGGER, checkpoint_data=kept))
     before = load_policy(run.path).state_dict()
-    resume(run.path, {"env.num_agents": [3, 5]} if kept else {})
+    resume(run.path, {"env.num_agents": [3, 5]} if kept else {}, evaluate=False)
     assert ("begin anew, with no data, because of env.num_agents=[3, 5]" in capsys.readouterr().out) == kept
     assert [line["step"] for line in run.read_metrics()] == [0, 1, 2, 3, 4]
     assert any(not torch.equal(value, before[name]) for name, value in load_policy(run.path).state_dict().items())
@@ -161,7 +155,7 @@ def test_what_cannot_change_is_named_and_nothing_is_touched(tmp_path):
 def test_the_best_policy_is_kept_beside_the_last(tmp_path):
     better = {"bc": "validation_loss", "dagger": "error"}
     for name, metric in better.items():
-        run = train(_config(tmp_path / name, **RUNS[name]))
+        run = train(_config(tmp_path / name, **RUNS[name]), evaluate=False)
         records = [record[metric] for record in run.read_metrics() if record[metric] == record[metric]]
         found = load_checkpoint(run.best)
         assert set(found.tensors) == {"policy"}
@@ -174,7 +168,7 @@ def test_the_best_policy_is_kept_beside_the_last(tmp_path):
 
 def test_a_run_that_fails_leaves_the_policies_of_before(tmp_path):
     settings = RUNS["bc of several, with noise from the error"]
-    run = train(_config(tmp_path, **settings))
+    run = train(_config(tmp_path, **settings), evaluate=False)
     before = {path: path.read_bytes() for path in run.path.glob("*/checkpoints/*/*")}
     assert len(before) >= 4 * 3  # of four policies
 
@@ -183,10 +177,10 @@ def test_a_run_that_fails_leaves_the_policies_of_before(tmp_path):
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        resume(run.path, {"trainer.cloning_updates": 8}, callbacks=[Break()])
+        resume(run.path, {"trainer.cloning_updates": 8}, callbacks=[Break()], evaluate=False)
     assert run.state == "failed"
     assert {path: path.read_bytes() for path in run.path.glob("*/checkpoints/*/*")} == before
-    resume(run.path)
+    resume(run.path, evaluate=False)
     assert run.state == "finished"
     assert "reason" not in run.status
 
@@ -198,7 +192,7 @@ def test_a_stopped_run_of_workers_ends_as_one_that_was_not(tmp_path, name, kind)
     if kind == "ray":
         pytest.importorskip("ray")
     settings = {**RUNS[name], "collector": CollectorConfig(kind, workers=2)}
-    straight = train(_config(tmp_path / "straight", **settings))
+    straight = train(_config(tmp_path / "straight", **settings), evaluate=False)
     run = _stop(tmp_path / "stopped", at=2, **settings)
-    resume(run.path)
+    resume(run.path, evaluate=False)
     _assert_equal(_all_of(straight), _all_of(run))

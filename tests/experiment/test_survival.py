@@ -24,7 +24,6 @@ import torch
 
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, TrainConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint, save_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
@@ -43,11 +42,6 @@ MOMENTS = 20
 FILE_CALLS = {"open", "write", "close", "mkdir", "fsync", "replace", "rename", "rmdir", "unlink", "scandir", "lstat"}
 
 
-@pytest.fixture(autouse=True)
-def _without_evaluation(monkeypatch):
-    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
-
-
 TRAINERS["short"] = dataclasses.replace(TRAINERS["dagger"], rounds=6)
 
 
@@ -56,14 +50,14 @@ def _config(runs: Path, trainer: str) -> TrainConfig:
     return TrainConfig(env=env_config, trainer=TRAINERS[trainer], runs=str(runs), threads=1)
 
 
-def _start(function, *arguments):
+def _start(function, *arguments, **options):
     """Call a function in a process of its own, without a word."""
 
     def work():
         silence = os.open(os.devnull, os.O_WRONLY)
         os.dup2(silence, 1)
         os.dup2(silence, 2)
-        function(*arguments)
+        function(*arguments, **options)
 
     process = multiprocessing.get_context("fork").Process(target=work)
     process.start()
@@ -88,13 +82,13 @@ def _assert_equal(one, other):
 @pytest.mark.parametrize("trainer", ["bc", "dagger", "mappo"])
 def test_killed_at_random_moments(tmp_path, trainer):
     began = time.monotonic()
-    straight = train(_config(tmp_path / "straight", trainer))
+    straight = train(_config(tmp_path / "straight", trainer), evaluate=False)
     duration = time.monotonic() - began
     moments = random.Random(0)
     ended = {"before its folder": 0, "before its first checkpoint": 0, "later": 0}
     for number in range(MOMENTS):
         runs = tmp_path / str(number)
-        process = _start(train, _config(runs, trainer))
+        process = _start(train, _config(runs, trainer), evaluate=False)
         time.sleep(moments.uniform(0.0, duration))
         process.kill()
         process.join()
@@ -106,7 +100,7 @@ def test_killed_at_random_moments(tmp_path, trainer):
             continue
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # no checkpoint may be damaged
-            run = resume(folder)
+            run = resume(folder, evaluate=False)
         _assert_equal(_contents(straight), _contents(run))
         assert run.state == "finished"
     print(f"{trainer} killed", ", ".join(f"{when} {count} times" for when, count in ended.items()))
@@ -151,7 +145,7 @@ def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path, finished):
     def train_on_a_small_disk():
         warnings.simplefilter("default")
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # of a file; the checkpoints are larger
-        train(_config(tmp_path / "runs", "short"))
+        train(_config(tmp_path / "runs", "short"), evaluate=False)
 
     process = _start(train_on_a_small_disk)
     process.join()
@@ -163,15 +157,13 @@ def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path, finished):
     assert "make room" in run.status["reason"]
     assert len(run.read_metrics()) == 7  # it went on to the end
     assert [path.name for path in run.checkpoints.iterdir()] == []
-    resume(folder)
+    resume(folder, evaluate=False)
     _assert_equal(_contents(finished), _contents(run))
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "evaluate_policies", lambda *_, **__: {})
-        return train(_config(tmp_path_factory.mktemp("finished"), "short"))
+    return train(_config(tmp_path_factory.mktemp("finished"), "short"), evaluate=False)
 
 
 def _damage(path: Path, how: str) -> None:
@@ -194,12 +186,12 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path, finished, how):
         with pytest.warns(RuntimeWarning, match="CHECKPOINT PASSED OVER"):
             assert load_checkpoint(folder / "checkpoints").step == 6
     with pytest.warns(RuntimeWarning, match="CHECKPOINT PASSED OVER"):
-        run = resume(folder)
+        run = resume(folder, evaluate=False)
     _assert_equal(straight, _contents(run))
     for file in run.checkpoints.glob("*/policy.safetensors"):
         _damage(file, how)
     with pytest.warns(RuntimeWarning), pytest.raises(InputError, match="restore it from a copy or train again"):
-        resume(folder)
+        resume(folder, evaluate=False)
 
 
 def test_two_runs_in_one_folder(finished):
@@ -214,7 +206,7 @@ def test_two_runs_in_one_folder(finished):
 
 def _refused(folder):
     with pytest.raises(InputError, match="in use by a training run"):
-        resume(folder)
+        resume(folder, evaluate=False)
 
 
 def test_a_killed_run_shows_as_killed(tmp_path, finished):

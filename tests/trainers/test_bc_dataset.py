@@ -20,7 +20,6 @@ from modgnn_rl.configs.schema import (
 from modgnn_rl.data.collect import collect
 from modgnn_rl.data.dataset import EpisodeDataset, EpisodeWindows
 from modgnn_rl.errors import InputError
-from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
@@ -36,25 +35,13 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return collect(CollectConfig(env=WORLD, episodes=EPISODES, steps=STEPS, num_envs=4, output=str(path)))
 
 
-@pytest.fixture(autouse=True)
-def _without_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What follows the training takes longer than it, and is tested elsewhere."""
-    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
-
-
 def run_bc(
     runs: Path, dataset: Path, *, env: FlockingConfig = WORLD, model: str = "pair_force", **settings: Any
 ) -> RunFolder:
     small = {"batch_size": 16, "cloning_steps": 10, "cloning_updates": 20, "num_val_envs": 2, "capacity": 10}
     trainer = BCConfig(dataset=str(dataset), **{**small, **settings})
-    return train(
-        TrainConfig(
-            env=env,
-            model=ModelConfig(name=model, hops=2),
-            trainer=trainer,
-            runs=str(runs),
-        )
-    )
+    config = TrainConfig(env=env, model=ModelConfig(name=model, hops=2), trainer=trainer, runs=str(runs))
+    return train(config, evaluate=False)
 
 
 def test_held_out_flights_are_not_trained_on(tmp_path: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,6 @@ from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import rollout
-from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
@@ -25,11 +24,6 @@ from modgnn_rl.trainers.mappo import anchor_weight
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 
 WORLD = FlockingConfig(num_agents=4, max_steps=15)
-
-
-@pytest.fixture(autouse=True)
-def _without_evaluation(monkeypatch):
-    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
 
 
 def _config(runs, *, env=WORLD, model=None, init_from=None, seed=0, name=None, **settings):
@@ -44,15 +38,10 @@ def _config(runs, *, env=WORLD, model=None, init_from=None, seed=0, name=None, *
 @pytest.fixture(scope="module")
 def cloned(tmp_path_factory):
     """The run folder of a policy that was cloned a little."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "evaluate_policies", lambda *_, **__: {})
-        trainer = BCConfig(
-            num_envs=1, batch_size=16, cloning_steps=20, cloning_updates=20, num_val_envs=1, ema_decay=0.5
-        )
-        model = ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
-        return train(
-            TrainConfig(env=WORLD, model=model, trainer=trainer, runs=str(tmp_path_factory.mktemp("runs")), threads=1)
-        )
+    trainer = BCConfig(num_envs=1, batch_size=16, cloning_steps=20, cloning_updates=20, num_val_envs=1, ema_decay=0.5)
+    model = ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
+    runs = str(tmp_path_factory.mktemp("runs"))
+    return train(TrainConfig(env=WORLD, model=model, trainer=trainer, runs=runs, threads=1), evaluate=False)
 
 
 def _scores(policy):
@@ -72,7 +61,7 @@ def test_training_begins_with_exactly_the_policy_of_the_other_run(cloned, tmp_pa
 
 
 def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_with(cloned, tmp_path):
-    run = train(_config(tmp_path, init_from=str(cloned.path), rounds=2, critic_warmup=2))
+    run = train(_config(tmp_path, init_from=str(cloned.path), rounds=2, critic_warmup=2), evaluate=False)
     assert run.config["model"]["name"] == "modgnn_mlp"
     assert torch.equal(_scores(load_policy(run.path)), _scores(load_policy(cloned.path)))
 
@@ -89,14 +78,14 @@ def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, m
     for number, seed in enumerate((1, 1, 2)):
         torch.manual_seed(number)
         before = torch.get_rng_state()
-        runs.append(train(_config(tmp_path, model=model, seed=seed, name=f"run{number}")))
+        runs.append(train(_config(tmp_path, model=model, seed=seed, name=f"run{number}"), evaluate=False))
         assert torch.equal(torch.get_rng_state(), before)
     metrics = [run.metrics_file.read_bytes() for run in runs]
     assert metrics[0] == metrics[1] != metrics[2]
 
 
 def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
-    run = train(_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15)))
+    run = train(_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15)), evaluate=False)
     checkpoint = load_checkpoint(run.checkpoints)
     of_learner = {"policy", "actor", "critic", "value_norm", "anchor", "optimizer", "generators"}
     of_flocks = {f"flocks-{size}.{part}" for size in (3, 5) for part in ("env", "carried")}
@@ -113,7 +102,7 @@ def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
 
 def test_each_size_has_metrics_of_its_own(cloned, tmp_path):
     env, pull = FlockingConfig(num_agents=[3, 5], max_steps=15), {"kl_coef": 0.2, "kl_rounds": 4}
-    metrics = train(_config(tmp_path, env=env, init_from=str(cloned.path), **pull)).read_metrics()
+    metrics = train(_config(tmp_path, env=env, init_from=str(cloned.path), **pull), evaluate=False).read_metrics()
     assert [line["step"] for line in metrics] == [1, 2, 3]
     common = ("reward", "cost/leader", "cost/effort", "error", "cohesion", "loss_critic", "kl_approx", "entropy")
     assert all({f"{size}/{name}" for size in (3, 5) for name in common} <= set(line) for line in metrics)
@@ -135,7 +124,7 @@ def test_each_size_has_metrics_of_its_own(cloned, tmp_path):
     "model", [ModelConfig(name="pair_force", hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)]
 )
 def test_it_flies_in_every_world(tmp_path, env, model):
-    for line in train(_config(tmp_path, env=env, model=model)).read_metrics():
+    for line in train(_config(tmp_path, env=env, model=model), evaluate=False).read_metrics():
         assert all(value == value for name, value in line.items() if "separation" not in name), line
 
 
@@ -189,7 +178,7 @@ def test_the_anchor_fades_linearly_after_the_warm_up():
 
 
 def test_a_fresh_policy_is_not_held_back(tmp_path):
-    metrics = train(_config(tmp_path, kl_coef=100.0)).read_metrics()
+    metrics = train(_config(tmp_path, kl_coef=100.0), evaluate=False).read_metrics()
     assert [line["kl_coef"] for line in metrics] == [0.0] * 3
     assert not any("4/loss_anchor" in line for line in metrics)
 
@@ -199,7 +188,8 @@ def test_callbacks_can_stop_it(tmp_path):
         def on_round(self, index, metrics):
             return index == 2
 
-    assert [line["step"] for line in train(_config(tmp_path), callbacks=[Stop()]).read_metrics()] == [1, 2]
+    run = train(_config(tmp_path), callbacks=[Stop()], evaluate=False)
+    assert [line["step"] for line in run.read_metrics()] == [1, 2]
 
 
 @pytest.mark.slow
@@ -224,6 +214,6 @@ def test_from_scratch_the_reward_rises(tmp_path):
     env = FlockingConfig(num_agents=3, max_steps=100, effort_cost=1.0, **others)
     rates = {"learning_rate": 1e-2, "critic_learning_rate": 1e-2, "gamma": 0.9}
     settings = {"rounds": 8, "steps_per_round": 16, "epochs": 4, "num_minibatches": 4}
-    run = train(_config(tmp_path, env=env, model=ModelConfig(name="gcn"), **rates, **settings))
+    run = train(_config(tmp_path, env=env, model=ModelConfig(name="gcn"), **rates, **settings), evaluate=False)
     rewards = [line["3/reward"] for line in run.read_metrics()]
     assert sum(rewards[-3:]) > 0.8 * sum(rewards[:3])

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import pytest
 import torch
 
 from modgnn_rl import load_policy, make_model
-from modgnn_rl.configs.schema import BCConfig, FlockingConfig, ModelConfig, TrainConfig
+from modgnn_rl.configs.schema import BCConfig, EvaluationConfig, FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
@@ -17,15 +19,10 @@ from modgnn_rl.trainers import bc as trainer_module
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise
 from modgnn_rl.trainers.collectors.flocks import FlockBuffer
 from modgnn_rl.trainers.imitation.learner import ImitationLearner, fit_together, validate_together
+from modgnn_rl.trainers.imitation.side_by_side import member_configs
 from modgnn_rl.trainers.loop.callbacks import Callback
-from modgnn_rl.trainers.loop.setup import side_by_side
 
 WORLD = FlockingConfig(num_agents=4, max_steps=30)
-
-
-@pytest.fixture
-def _without_evaluation(monkeypatch):
-    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
 
 
 def _config(runs, *, model=None, seed=0, **settings):
@@ -56,13 +53,20 @@ SEVERAL = {"models": ["modgnn_mlp", "gcn"], "hops": [1, 2], "seeds": 2}
 NAMES = [f"{model}-K{hops}-seed{seed}" for model in ("modgnn_mlp", "gcn") for hops in (1, 2) for seed in (0, 1)]
 
 
-def test_a_run_of_several_policies(tmp_path, monkeypatch):
-    """Folders, names, metrics."""
-    evaluated = []
-    monkeypatch.setattr(training, "evaluate_policies", lambda _, policies, *__, **___: evaluated.append(policies) or {})
-    run = train(_config(tmp_path, **SEVERAL, cloning_steps=8, num_val_envs=1))
+class _Trained(Callback):
+    """Keeps the policies that training ended with."""
+
+    def on_end(self, policies):
+        self.policies = policies
+
+
+def test_a_run_of_several_policies(tmp_path):
+    """Folders, names, metrics, and the rows of the evaluation."""
+    config, trained = _config(tmp_path, **SEVERAL, cloning_steps=8, num_val_envs=1), _Trained()
+    run = train(dataclasses.replace(config, evaluation=EvaluationConfig(num_flocks=2, steps=4)), callbacks=[trained])
     assert sorted(path.name for path in run.path.iterdir() if (path / "config.yaml").exists()) == sorted(NAMES)
-    assert [list(policies) for policies in evaluated] == [NAMES]
+    rows = json.loads((run.path / "evaluation.json").read_text())["4"]["rows"]
+    assert list(rows)[: len(NAMES)] == list(trained.policies) == NAMES
     for line in run.read_metrics():
         expected = {f"{name}/4/{metric}" for name in NAMES for metric in ("loss", "validation_loss")}
         assert expected <= set(line)
@@ -78,25 +82,26 @@ def test_a_run_of_several_policies(tmp_path, monkeypatch):
         assert (config["seed"] == 0) == (seed == "seed0")
         policy = load_policy(run.path / name)
         assert policy.hops == int(hops[1:])
-        assert _equal(policy, evaluated[0][name])
+        assert _equal(policy, trained.policies[name])
         weights.append(torch.cat([value.flatten() for value in policy.state_dict().values()]))
     for pair in range(0, len(NAMES), 2):
         assert not torch.equal(weights[pair], weights[pair + 1])  # seeds
     assert _equal(load_policy(run.path), load_policy(run.path / NAMES[0]))
 
 
-@pytest.mark.usefixtures("_without_evaluation")
 def test_one_seed_fixes_a_run_of_several_policies(tmp_path):
-    metrics = [train(_config(tmp_path, **SEVERAL, cloning_updates=2)).metrics_file.read_bytes() for _ in range(2)]
+    metrics = [
+        train(_config(tmp_path, **SEVERAL, cloning_updates=2), evaluate=False).metrics_file.read_bytes()
+        for _ in range(2)
+    ]
     assert metrics[0] == metrics[1]
 
 
-@pytest.mark.usefixtures("_without_evaluation")
 def test_a_policy_trained_beside_others_is_the_one_trained_alone(tmp_path):
     """The first of several seeds draws; its data, weights and batches are those of a run of its own."""
     model = ModelConfig(name="mpnn", layers=2, hidden=8)
-    alone = train(_config(tmp_path, model=model))
-    several = train(_config(tmp_path, model=model, seeds=2))
+    alone = train(_config(tmp_path, model=model), evaluate=False)
+    several = train(_config(tmp_path, model=model, seeds=2), evaluate=False)
     mine, theirs = load_policy(several.path / "mpnn-K1-seed0"), load_policy(alone.path)
     for name, value in mine.state_dict().items():
         torch.testing.assert_close(value, theirs.state_dict()[name], rtol=1e-4, atol=1e-5)
@@ -105,17 +110,16 @@ def test_a_policy_trained_beside_others_is_the_one_trained_alone(tmp_path):
 
 
 def test_names_and_seeds_of_the_members():
-    members = side_by_side(_config("runs", **SEVERAL))
+    members = member_configs(_config("runs", **SEVERAL))
     assert list(members) == NAMES
     assert members["gcn-K2-seed0"].model == ModelConfig(name="gcn", hops=2, hidden=8)
     assert members["gcn-K2-seed1"].seed == members["modgnn_mlp-K1-seed1"].seed != 0
-    assert list(side_by_side(_config("runs"))) == ["pair_force"]
-    assert list(side_by_side(_config("runs", models=["gcn"], hops=[3]))) == ["gcn"]
-    assert list(side_by_side(_config("runs", models="gcn", hops=[1, 3]))) == ["gcn-K1", "gcn-K3"]
-    assert list(side_by_side(_config("runs", seeds=2))) == ["pair_force-K1-seed0", "pair_force-K1-seed1"]
+    assert list(member_configs(_config("runs"))) == ["pair_force"]
+    assert list(member_configs(_config("runs", models=["gcn"], hops=[3]))) == ["gcn"]
+    assert list(member_configs(_config("runs", models="gcn", hops=[1, 3]))) == ["gcn-K1", "gcn-K3"]
+    assert list(member_configs(_config("runs", seeds=2))) == ["pair_force-K1-seed0", "pair_force-K1-seed1"]
 
 
-@pytest.mark.usefixtures("_without_evaluation")
 def test_members_are_trained_by_what_they_are_told_to(tmp_path):
     class Start(Callback):
         def on_start(self, policies):
@@ -125,9 +129,9 @@ def test_members_are_trained_by_what_they_are_told_to(tmp_path):
             }
 
     start = Start()
-    train(_config(tmp_path, models=["gcn"], hops=[1, 2], cloning_updates=1), callbacks=[start])
+    train(_config(tmp_path, models=["gcn"], hops=[1, 2], cloning_updates=1), callbacks=[start], evaluate=False)
     for hops in (1, 2):
-        fresh = side_by_side(_config(tmp_path, models=["gcn"], hops=[1, 2]))[f"gcn-K{hops}"]
+        fresh = member_configs(_config(tmp_path, models=["gcn"], hops=[1, 2]))[f"gcn-K{hops}"]
         expected = trainer_module.make_learner(fresh, (1, 1)).ema_policy.state_dict()
         assert all(torch.equal(value, expected[key]) for key, value in start.policies[f"gcn-K{hops}"].items())
 
@@ -149,7 +153,6 @@ def test_what_cannot_be_trained_is_refused_before_anything_is_created(tmp_path, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.usefixtures("_without_evaluation")
 def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path, monkeypatch):
     flown, forward = [], ActionNoise.forward
 
@@ -159,7 +162,7 @@ def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path
         return forward(self, tensordict)
 
     monkeypatch.setattr(ActionNoise, "forward", watched)
-    metrics = train(_config(tmp_path, dart=True, noise=0.1, cloning_updates=40)).read_metrics()
+    metrics = train(_config(tmp_path, dart=True, noise=0.1, cloning_updates=40), evaluate=False).read_metrics()
     # Tried out, and flown for validation, without noise; each part with the error of the round before it.
     after = [metrics[index]["4/validation_loss"] ** 0.5 for index in (9, 19, 29)]
     assert flown == pytest.approx([0.0, 0.1, 0.0, *after])
@@ -168,7 +171,6 @@ def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path
     assert [line["noise"] for line in metrics] == pytest.approx(expected)
 
 
-@pytest.mark.usefixtures("_without_evaluation")
 @pytest.mark.parametrize("rounds", [2, 6])
 @pytest.mark.parametrize(("settings", "sets"), [({}, 1), ({"dart": True}, 4)])
 def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settings, sets, rounds):
@@ -179,7 +181,7 @@ def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settin
         seen.append((*rollouts.shape, self.seen))
 
     monkeypatch.setattr(FlockBuffer, "keep", watched)
-    train(_config(tmp_path, cloning_updates=rounds, stride=1, noise=0.2, **settings))
+    train(_config(tmp_path, cloning_updates=rounds, stride=1, noise=0.2, **settings), evaluate=False)
     of_training = [entry for entry in seen if entry[0] == 8]
     assert len(of_training) == sets
     assert sum(steps for _, steps, _ in of_training) == 12

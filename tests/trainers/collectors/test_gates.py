@@ -12,7 +12,6 @@ from modgnn_rl import load_policy, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, Ensemble, SafetyGate, disagreement, ensemble_std
@@ -203,20 +202,15 @@ def test_disturbed_flights_are_labelled_with_the_expert_of_the_states_that_they_
     assert noise.std().item() == pytest.approx(0.3, rel=0.1)
 
 
-@pytest.fixture
-def _without_evaluation(monkeypatch):
-    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
-
-
 def _run(runs, model, **settings):
     small = {"num_envs": 1, "batch_size": 16, "capacity": 100, "cloning_steps": 6, "cloning_updates": 4}
     small |= {"rounds": 4, "steps_per_round": 6, "updates_per_round": 2, "hold_steps": 3, "num_val_envs": 1}
     trainer = DAggerConfig(**{**small, **settings})
     env = FlockingConfig(num_agents=4, max_steps=20)
-    return train(TrainConfig(env=env, model=model, trainer=trainer, runs=str(runs), threads=1))
+    config = TrainConfig(env=env, model=model, trainer=trainer, runs=str(runs), threads=1)
+    return train(config, evaluate=False)
 
 
-@pytest.mark.usefixtures("_without_evaluation")
 @pytest.mark.parametrize(
     ("settings", "model"),
     [
@@ -246,7 +240,6 @@ def test_a_run_of_dagger_is_fixed_by_its_seed(tmp_path, settings, model):
         assert any(not torch.equal(value, weights[name]) for name, value in other.items())
 
 
-@pytest.mark.usefixtures("_without_evaluation")
 def test_a_strict_gate_lets_the_expert_fly_and_a_lax_one_does_not(tmp_path):
     shares = []
     for threshold in (1e-6, 1e6):
@@ -261,7 +254,6 @@ def test_a_strict_gate_lets_the_expert_fly_and_a_lax_one_does_not(tmp_path):
     assert shares == [[1.0] * 4, [0.0] * 4]
 
 
-@pytest.mark.usefixtures("_without_evaluation")
 def test_a_run_stops_on_a_plateau(tmp_path):
     settings = {"plateau_rounds": 1, "plateau_gain": 1.0, "beta_rounds": 1, "beta": 0.0}
     metrics = _run(tmp_path, ModelConfig(name="pair_force", hidden=8), **settings).read_metrics()

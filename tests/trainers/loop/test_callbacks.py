@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from typing import Any
 
@@ -11,8 +12,15 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from modgnn_rl import load_policy
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
-from modgnn_rl.experiment import training
+from modgnn_rl.configs.schema import (
+    BCConfig,
+    DAggerConfig,
+    EvaluationConfig,
+    FlockingConfig,
+    MAPPOConfig,
+    ModelConfig,
+    TrainConfig,
+)
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.trainers.loop.callbacks import Callback, StopOnPlateau
@@ -29,11 +37,6 @@ TRAINERS = {
 }
 # Number of the rounds in which rollouts come in, and of all rounds.
 ROUNDS = {"bc": ([1], [1, 2, 3, 4]), "dagger": ([0, 0, 1, 2, 3], [0, 1, 2, 3]), "mappo": ([1, 2, 3], [1, 2, 3])}
-
-
-@pytest.fixture(autouse=True)
-def _without_evaluation(monkeypatch):
-    monkeypatch.setattr(training, "evaluate_policies", lambda *_, **__: {})
 
 
 def _config(runs, trainer, **others):
@@ -73,7 +76,7 @@ class _Watch(Callback):
 @pytest.mark.parametrize("name", TRAINERS)
 def test_the_four_places(tmp_path, name):
     watch = _Watch()
-    run = train(_config(tmp_path, TRAINERS[name]), callbacks=[watch])
+    run = train(_config(tmp_path, TRAINERS[name]), callbacks=[watch], evaluate=False)
     kinds = {kind: [value for called, value in watch.calls if called == kind] for kind, _ in watch.calls}
     assert watch.calls[0] == ("start", ("pair_force",))
     assert watch.calls[-1] == ("end", ("pair_force",))
@@ -93,7 +96,7 @@ def test_the_four_places(tmp_path, name):
 @pytest.mark.parametrize("name", TRAINERS)
 def test_any_of_several_callbacks_stops_the_training_and_all_are_called(tmp_path, name):
     watches = [_Watch(), _Watch(stop_at=2), _Watch()]
-    run = train(_config(tmp_path, TRAINERS[name]), callbacks=watches)
+    run = train(_config(tmp_path, TRAINERS[name]), callbacks=watches, evaluate=False)
     assert run.read_metrics()[-1]["step"] == 2
     assert [watch.calls for watch in watches[1:]] == [watches[0].calls] * 2
     assert ("end", ("pair_force",)) in watches[0].calls
@@ -108,7 +111,7 @@ def test_what_a_callback_changes_in_the_flights_is_learned_from(tmp_path, name):
 
     losses = []
     for callbacks in ([], [Zero()]):
-        run = train(_config(tmp_path, TRAINERS[name]), callbacks=callbacks)
+        run = train(_config(tmp_path, TRAINERS[name]), callbacks=callbacks, evaluate=False)
         losses.append(next(line["4/loss"] for line in run.read_metrics() if "4/loss" in line))
     assert losses[0] != losses[1]
 
@@ -120,7 +123,7 @@ def test_a_callback_that_fails_ends_the_run_with_its_own_error(tmp_path):
 
     watch = Fail()
     with pytest.raises(RuntimeError, match="mine"):
-        train(_config(tmp_path, TRAINERS["dagger"]), callbacks=[watch])
+        train(_config(tmp_path, TRAINERS["dagger"]), callbacks=[watch], evaluate=False)
     assert "end" not in {kind for kind, _ in watch.calls}
 
 
@@ -158,7 +161,7 @@ def test_a_plateau_may_be_that_of_another_metric():
 @pytest.mark.parametrize("name", ["dagger", "mappo"])
 def test_the_error_of_a_round_is_the_mean_over_the_sizes(tmp_path, name):
     config = dataclasses.replace(_config(tmp_path, TRAINERS[name]), env=FlockingConfig(num_agents=[3, 4]))
-    run = train(config)
+    run = train(config, evaluate=False)
     for line in run.read_metrics():
         if line["step"] > 0:
             assert line["error"] == pytest.approx((line["3/error"] + line["4/error"]) / 2, nan_ok=True)
@@ -166,7 +169,7 @@ def test_the_error_of_a_round_is_the_mean_over_the_sizes(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["bc", "dagger"])
-def test_an_expert_of_ones_own_is_learned_from(tmp_path, monkeypatch, name):
+def test_an_expert_of_ones_own_is_learned_from_and_evaluated_against(tmp_path, name):
     """It stands still; the trained policy does too, and its errors are against it."""
     still = TensorDictModule(
         lambda observation: 0.0 * observation[..., :3],
@@ -187,9 +190,9 @@ def test_an_expert_of_ones_own_is_learned_from(tmp_path, monkeypatch, name):
             hold_steps=5,
         ),
     }[name]
-    seen = []
-    monkeypatch.setattr(training, "evaluate_policies", lambda *_, expert=None, **__: seen.append(expert) or {})
-    run = train(_config(tmp_path, trainer), expert=still)
-    assert seen == [still]
+    evaluation = EvaluationConfig(num_flocks=2, steps=4)
+    run = train(_config(tmp_path, trainer, evaluation=evaluation), expert=still)
+    rows = json.loads((run.path / "evaluation.json").read_text())["4"]["rows"]
+    assert rows["expert"]["error"]["mean"] == rows["zero action"]["error"]["mean"] == 0
     errors = [line["4/error"] for line in run.read_metrics() if "4/error" in line]
     assert errors[-1] < 0.01  # far from Reynolds, whose mean square action is above 0.2
