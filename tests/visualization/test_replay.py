@@ -229,7 +229,7 @@ def test_the_page_plays_and_holds_what_was_recorded(page, dark):
         for step in (0, 17, 59):
             window.run(f"goTo({step} * PERIOD)")
             assert window.run("frameNow()") == step
-            assert window.run(f"findLinks(rollouts[0], {step}).directed") == len(seen[step][0])
+            assert window.run(f"findEdges(rollouts[0], {step}).directed") == len(seen[step][0])
             at = window.run(f"Array.from({{length: N}}, (_, n) => rollouts[0].position[n * T + {step}])")
             assert at == recording.position[step, :, 0].tolist()
         _quiet(window)
