@@ -15,12 +15,12 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from modgnn_rl.errors import InputError, suggestion
 
-__all__ = ["check", "flat", "setting"]
+__all__ = ["as_list", "check", "flat", "setting"]
 
 
 def setting(
@@ -114,3 +114,8 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in tree.items():
         leaves |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return leaves
+
+
+def as_list(value: Any) -> list[Any]:
+    """A setting that is one value or a list of them, as a list."""
+    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]

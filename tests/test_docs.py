@@ -90,7 +90,7 @@ def test_every_module_is_on_a_page_of_the_api(scripts: Callable[[str], ModuleTyp
 def test_every_setting_is_on_the_pages_with_its_documentation(kind: type, reference: dict[str, str]) -> None:
     text = "".join(reference.values())
     for field in dataclasses.fields(kind):
-        if doc := field.metadata.get("doc"):
+        if doc := field.metadata.get("help"):
             assert re.search(rf"^\| \[`([\w.]+\.)?{field.name}`\].*{re.escape(doc[:12])}", text, re.MULTILINE), (
                 field.name
             )
