@@ -86,7 +86,7 @@ def watched() -> Clock:
     clock.watch(AveragedModel, "update_parameters", "optimiser and moving average")
     clock.watch(TrainingLoop, "_record", "logging")
     clock.watch(DashboardCallback, "on_round", "logging")
-    clock.watch(DashboardCallback, "on_flights", "logging")
+    clock.watch(DashboardCallback, "on_collect", "logging")
     clock.watch(DashboardCallback, "on_start", "logging: reference rollouts, once")
     clock.watch(TrainingLoop, "_save", "checkpoints")
     clock.watch(TrainingLoop, "_save_best", "checkpoints")

@@ -77,7 +77,7 @@ class Signal(Callback):
     def __init__(self, at, number=signal.SIGTERM):
         self.at, self.number = at, number
 
-    def on_flights(self, index, rollouts):
+    def on_collect(self, index, rollouts):
         """Send it."""
         if index == self.at:
             self.at = None

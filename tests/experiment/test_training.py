@@ -266,7 +266,7 @@ def test_training_goes_on_under_faults_and_learns_from_the_true_state(tmp_path, 
     seen = []
 
     class DashboardCallback(Callback):
-        def on_flights(self, index, rollouts):
+        def on_collect(self, index, rollouts):
             seen.append(rollouts.select(("agents", "state"), ("agents", "mask"), ("agents", "expert_action")).clone())
 
     run = train(

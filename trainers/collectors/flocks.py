@@ -16,7 +16,7 @@ from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, Ensemble, SafetyGate, ensemble_std
 from modgnn_rl.trainers.collectors.local import make_collector
 from modgnn_rl.trainers.collectors.windows import as_windows, reservoir_places, window_of
-from modgnn_rl.trainers.common.state import Part, Tensors
+from modgnn_rl.trainers.common.state import Checkpointable, TensorGroups
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = [
@@ -130,7 +130,7 @@ class FlockBuffer:
         """Use data that somebody else keeps; checkpoints do not hold them."""
         self.buffer, self._owns_data = buffer, False
 
-    def state(self) -> tuple[Tensors, dict[str, Any]]:
+    def state(self) -> tuple[TensorGroups, dict[str, Any]]:
         """What a checkpoint holds of rollouts and data."""
         tensors, values = self.rollouts.state()
         tensors["mixture"] = self.mixture.state()
@@ -140,7 +140,7 @@ class FlockBuffer:
             values["writer"] = self.buffer.writer.state_dict()
         return tensors, values
 
-    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
+    def restore(self, tensors: TensorGroups, values: dict[str, Any]) -> None:
         """Go on from what `state` gave; without data where the checkpoint has none.
 
         Raises:
@@ -205,7 +205,7 @@ def make_validation_buffers(
     return make_buffers(apart, policies, expert, steps=steps, hold_steps=hold_steps)
 
 
-def named_buffers(training: Mapping[int, Part], validation: Mapping[int, Part]) -> dict[str, Any]:
+def named_buffers(training: Mapping[int, Checkpointable], validation: Mapping[int, Checkpointable]) -> dict[str, Any]:
     """All flocks of a run by the names that checkpoints give them."""
     return {
         **{str(size): group for size, group in training.items()},

@@ -13,7 +13,7 @@ from torchrl.collectors import Collector
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.trainers.collectors.remote import RemoteCollector
-from modgnn_rl.trainers.common.state import Tensors
+from modgnn_rl.trainers.common.state import TensorGroups
 from modgnn_rl.utils.seeds import derive_seed, seeded
 
 __all__ = ["FlockCollector", "make_collector"]
@@ -73,14 +73,14 @@ class FlockCollector:
         """All that draws at random here, by name."""
         return {"env": self.env.generator, "faults": self.env.faults.generator, "noise": self.noise}
 
-    def state(self) -> tuple[Tensors, dict[str, Any]]:
+    def state(self) -> tuple[TensorGroups, dict[str, Any]]:
         """What a checkpoint holds of the rollouts."""
         # TorchRL has no public name for what it carries from step to step, messages among it; its own numbers of
         # trajectories need not be the same.
         carried = self.collector._carrier.exclude("collector").flatten_keys("/")
         return {"env": self.env.snapshot(), "carried": dict(carried.items())}, {}
 
-    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
+    def restore(self, tensors: TensorGroups, values: dict[str, Any]) -> None:
         """Go on from what `state` gave.
 
         Raises:

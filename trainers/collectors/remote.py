@@ -21,7 +21,7 @@ from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.trainers.collectors.worker import WorkerSpec, packed, weights_of
 from modgnn_rl.trainers.collectors.workers import ProcessWorker, RayWorker, Worker, WorkerEndedError, close_all
-from modgnn_rl.trainers.common.state import Tensors
+from modgnn_rl.trainers.common.state import TensorGroups
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["RemoteCollector", "check_collector"]
@@ -127,19 +127,19 @@ class RemoteCollector:
         rollouts = [self._with_own_ids(index, rollouts) for index, rollouts in enumerate(flown)]
         return torch.cat(rollouts).to(self.device)
 
-    def state(self) -> tuple[Tensors, dict[str, Any]]:
+    def state(self) -> tuple[TensorGroups, dict[str, Any]]:
         """What a checkpoint holds of the rollouts, worker by worker."""
         states = self._ask_all("state", [()] * len(self._workers))
         return {f"worker{index}-{group}": own[group] for index, own in enumerate(states) for group in own}, {}
 
-    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
+    def restore(self, tensors: TensorGroups, values: dict[str, Any]) -> None:
         """Go on from what `state` gave.
 
         Raises:
             KeyError, RuntimeError: these are rollouts of other flocks, or of another number of workers.
         """
         weights = weights_of(self.behaviour)
-        states: list[Tensors] = [{} for _ in self._workers]
+        states: list[TensorGroups] = [{} for _ in self._workers]
         for name, group in tensors.items():
             worker, _, key = name.partition("-")
             if worker.startswith("worker"):

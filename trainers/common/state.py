@@ -1,4 +1,4 @@
-"""All that a training run continues from, as one checkpoint, and back."""
+"""The state of a training run: collected from its parts for a checkpoint, and given back to them."""
 
 from __future__ import annotations
 
@@ -8,84 +8,103 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.checkpoint import Checkpoint
 
-__all__ = ["Part", "Tensors", "gather", "moments_of", "restore_moments", "scatter"]
+__all__ = [
+    "Checkpointable",
+    "Learner",
+    "TensorGroups",
+    "collect_state",
+    "optimizer_state",
+    "restore_optimizer",
+    "restore_state",
+]
 
-Tensors = dict[str, dict[str, Tensor]]
+TensorGroups = dict[str, dict[str, Tensor]]
 
 
-class Part(Protocol):
-    """A part of a run that has a state: a learner, a group of flocks."""
+class Checkpointable(Protocol):
+    """A part of a run whose state goes into checkpoints: a learner, a group of environments and its data."""
 
     @property
     def generators(self) -> dict[str, torch.Generator]:
-        """All that draws at random there, by name."""
+        """All random number generators of this part, by name; their states are saved with it."""
 
-    def state(self) -> tuple[Tensors, dict[str, Any]]:
-        """What a checkpoint holds of it: groups of named tensors, and plain values."""
+    def state(self) -> tuple[TensorGroups, dict[str, Any]]:
+        """The state: groups of named tensors, and values that JSON can hold."""
 
-    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
-        """Go on from what `state` gave."""
+    def restore(self, tensors: TensorGroups, values: dict[str, Any]) -> None:
+        """Return to a state that `state` returned."""
 
 
-def gather(parts: Mapping[str, Part]) -> tuple[Tensors, dict[str, Any]]:
-    """The states of all parts, and of their generators, as groups of tensors and values of one checkpoint.
+class Learner(Checkpointable, Protocol):
+    """What a training loop needs to know of a learner."""
+
+    updates_done: int
+
+    @property
+    def ema_policy(self) -> ModGNN:
+        """The policy to act with, to evaluate and to save: the moving average of the weights."""
+
+
+def collect_state(parts: Mapping[str, Checkpointable]) -> tuple[TensorGroups, dict[str, Any]]:
+    """The states of all parts and of their generators, as the tensors and values of one checkpoint.
 
     Args:
-        parts: by name; groups and values of all but the first are called ``<part>.<name>``.
+        parts: by name. Groups and values of the first keep their names; those of the others become ``<part>.<name>``.
     """
-    tensors: Tensors = {"generators": {}}
+    tensors: TensorGroups = {"generators": {}}
     values: dict[str, Any] = {}
-    for own, part in _prefixed(parts):
+    for prefix, part in _prefixed(parts):
         groups, plain = part.state()
-        tensors |= {f"{own}{group}": named for group, named in groups.items()}
-        values |= {f"{own}{name}": value for name, value in plain.items()}
-        drawn = {f"{own}{name}": generator.get_state() for name, generator in part.generators.items()}
-        tensors["generators"] |= drawn
+        tensors |= {f"{prefix}{group}": named for group, named in groups.items()}
+        values |= {f"{prefix}{name}": value for name, value in plain.items()}
+        states = {f"{prefix}{name}": generator.get_state() for name, generator in part.generators.items()}
+        tensors["generators"] |= states
     return tensors, values
 
 
-def scatter(parts: Mapping[str, Part], checkpoint: Checkpoint, *, with_generators: bool = True) -> None:
-    """Give parts their states back; the first is the one that was first in `gather`.
+def restore_state(parts: Mapping[str, Checkpointable], checkpoint: Checkpoint, *, with_generators: bool = True) -> None:
+    """Give all parts the states that `collect_state` has collected.
 
     Args:
-        parts: by name.
-        checkpoint: what `gather` gave.
-        with_generators: whether to draw on as well, or anew.
+        parts: by the names used there, the same one first.
+        checkpoint: the checkpoint.
+        with_generators: whether to restore the states of the generators too.
 
     Raises:
-        KeyError: the checkpoint holds no state of a part.
-        RuntimeError: it does not fit.
+        KeyError: the checkpoint has no state of a part.
+        RuntimeError: the state of a part does not fit it.
     """
-    for own, part in _prefixed(parts):
-        part.restore(_under(own, checkpoint.tensors), _under(own, checkpoint.state))
+    for prefix, part in _prefixed(parts):
+        part.restore(_without_prefix(prefix, checkpoint.tensors), _without_prefix(prefix, checkpoint.state))
         if with_generators:
-            drawn = _under(own, checkpoint.tensors["generators"])
+            states = _without_prefix(prefix, checkpoint.tensors["generators"])
             for name, generator in part.generators.items():
-                generator.set_state(drawn[name])
+                generator.set_state(states[name])
 
 
-def _prefixed(parts: Mapping[str, Part]) -> list[tuple[str, Part]]:
+def _prefixed(parts: Mapping[str, Checkpointable]) -> list[tuple[str, Checkpointable]]:
     return [(f"{name}." if number else "", part) for number, (name, part) in enumerate(parts.items())]
 
 
-def _under(prefix: str, named: Mapping[str, Any]) -> dict[str, Any]:
-    """The entries of one part, by the names that it gave them."""
+def _without_prefix(prefix: str, named: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries of one part, under the names that it gave them."""
     length = len(prefix)
     return {name[length:]: value for name, value in named.items() if name[: name.rfind(".") + 1] == prefix}
 
 
-def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """What an optimiser remembers of each parameter, as named tensors."""
+def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """The state of an optimiser (step counts, moments) as named tensors, ``<parameter's index>.<name>``."""
     entries = optimizer.state_dict()["state"].items()
     return {f"{index}.{name}": value for index, entry in entries for name, value in entry.items()}
 
 
-def restore_moments(optimizer: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
-    """Let an optimiser remember what `moments_of` gave."""
+def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Load what `optimizer_state` returned; learning rates and other options stay as they are."""
     state: dict[int, dict[str, Tensor]] = {}
-    for key, value in moments.items():
+    for key, value in tensors.items():
         index, _, name = key.partition(".")
         state.setdefault(int(index), {})[name] = value
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

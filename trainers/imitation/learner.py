@@ -21,7 +21,7 @@ from modgnn_rl.trainers.collectors.windows import are_alike
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.optimization import GuardedOptimizer
 from modgnn_rl.trainers.common.sampling import random_receivers
-from modgnn_rl.trainers.common.state import Tensors, moments_of, restore_moments
+from modgnn_rl.trainers.common.state import TensorGroups, optimizer_state, restore_optimizer
 from modgnn_rl.trainers.imitation.loss import hide_velocities, imitation_loss, random_rotations, rotate, stacked_losses
 from modgnn_rl.utils.seeds import derive_seed
 
@@ -118,17 +118,17 @@ class ImitationLearner:
         """All that draws at random here, by name."""
         return {"learner": self.generator, "validation": self.validating}
 
-    def state(self) -> tuple[Tensors, dict[str, Any]]:
+    def state(self) -> tuple[TensorGroups, dict[str, Any]]:
         """What a checkpoint holds of the learner: named tensors, and plain values."""
         tensors = {
             "policy": self.ema_policy.state_dict(),
             "trained": self.policy.state_dict(),
-            "optimizer": moments_of(self.optimizer),
+            "optimizer": optimizer_state(self.optimizer),
         }
         averaged, scheduled = int(self.averaged.n_averaged), self.scheduler.last_epoch
         return tensors, {"updates": self.updates_done, "averaged": averaged, "scheduled": scheduled}
 
-    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
+    def restore(self, tensors: TensorGroups, values: dict[str, Any]) -> None:
         """Go on from what `state` gave; the learning rate is that of the run as it is planned now.
 
         Raises:
@@ -137,7 +137,7 @@ class ImitationLearner:
         self.policy.load_state_dict(tensors["trained"])
         self.ema_policy.load_state_dict(tensors["policy"])
         self.averaged.n_averaged.fill_(values["averaged"])
-        restore_moments(self.optimizer, tensors["optimizer"])
+        restore_optimizer(self.optimizer, tensors["optimizer"])
         self.updates_done = int(values["updates"])
         self.scheduler.last_epoch = int(values["scheduled"])
         rate = self.optimizer.param_groups[0]["lr"] = self.scheduler.lr_lambdas[0](self.scheduler.last_epoch)

@@ -32,7 +32,7 @@ class Callback:
             policies: what will be returned at the end, by name; their weights change while training goes on.
         """
 
-    def on_flights(self, index: int, rollouts: TensorDictBase) -> None:
+    def on_collect(self, index: int, rollouts: TensorDictBase) -> None:
         """Rollouts of a round have come in and are not yet learned from.
 
         Args:

@@ -62,7 +62,7 @@ class DashboardCallback(Callback):
         if self._makes_films:
             self._attempt("films", check_video)
 
-    def on_flights(self, index: int, rollouts: TensorDictBase) -> None:
+    def on_collect(self, index: int, rollouts: TensorDictBase) -> None:
         """Show how the components of the flown actions are distributed, m/s."""
         self._attempt("actions", lambda: self._show_actions(index, rollouts))
 

@@ -10,7 +10,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -23,26 +23,16 @@ from modgnn_rl.trainers.collectors.flocks import FlockBuffer
 from modgnn_rl.trainers.collectors.local import FlockCollector
 from modgnn_rl.trainers.collectors.remote import RemoteCollector
 from modgnn_rl.trainers.common import distributed
-from modgnn_rl.trainers.common.state import Part, gather, scatter
+from modgnn_rl.trainers.common.state import Checkpointable, Learner, collect_state, restore_state
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.utils.signals import Stopped
 
-__all__ = ["Learns", "TrainingLoop"]
+__all__ = ["TrainingLoop"]
 
 BEST_ROUNDS = 5  # rounds over which scores are averaged
 SAVING_SHARE = 1 / 70  # of the time goes into checkpoints at most: large data are written less often
-
-
-class Learns(Part, Protocol):
-    """What a run is about: a learner."""
-
-    updates_done: int
-
-    @property
-    def ema_policy(self) -> ModGNN:
-        """The policy so far."""
 
 
 class TrainingLoop:
@@ -67,7 +57,7 @@ class TrainingLoop:
     def __init__(
         self,
         context: TrainContext,
-        learners: Mapping[str, Learns],
+        learners: Mapping[str, Learner],
         flocks: Mapping[str, FlockBuffer | FlockCollector | RemoteCollector],
         total: int,
         *,
@@ -153,7 +143,7 @@ class TrainingLoop:
     def on_collect(self, rollouts: TensorDictBase) -> TensorDictBase:
         """Show rollouts of this round to the callbacks before they are learned from; returns them."""
         for callback in self.callbacks:
-            callback.on_flights(self.step, rollouts)
+            callback.on_collect(self.step, rollouts)
         return rollouts
 
     def log(
@@ -205,7 +195,7 @@ class TrainingLoop:
             return
         began = time.monotonic()
         try:
-            tensors, values = gather(self._parts())
+            tensors, values = collect_state(self._parts())
             save_checkpoint(
                 self.run.checkpoints, self.round, tensors, values | self._values(), keep=self.settings.keep_checkpoints
             )
@@ -237,7 +227,7 @@ class TrainingLoop:
             except OSError as error:
                 self._complain("the best policy", error, last=False)
 
-    def _parts(self, *, with_flocks: bool = True) -> dict[str, Part]:
+    def _parts(self, *, with_flocks: bool = True) -> dict[str, Checkpointable]:
         flocks = {f"flocks-{name}": group for name, group in self.flocks.items()} if with_flocks else {}
         return {**self.learners, **flocks}
 
@@ -271,7 +261,7 @@ class TrainingLoop:
             return
         values = checkpoint.state
         try:
-            scatter(self._parts(with_flocks=self.context.keeps_flocks), checkpoint, with_generators=first)
+            restore_state(self._parts(with_flocks=self.context.keeps_flocks), checkpoint, with_generators=first)
             self.round = self._saved = int(values["round"])
             self.count, self.state, self._best = int(values["count"]), values["memory"], values["best"]
             self._scores = values["scores"]

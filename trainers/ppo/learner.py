@@ -19,7 +19,7 @@ from modgnn_rl.trainers.collectors.windows import as_windows
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.optimization import GuardedOptimizer
 from modgnn_rl.trainers.common.sampling import random_receivers
-from modgnn_rl.trainers.common.state import Tensors, moments_of, restore_moments
+from modgnn_rl.trainers.common.state import TensorGroups, optimizer_state, restore_optimizer
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.trainers.ppo.critic import FlockCritic
 from modgnn_rl.trainers.ppo.loss import ANCHOR, KLPenaltyMAPPOLoss, SharedValueNorm
@@ -181,7 +181,7 @@ class PPOLearner:
         names = ("loss_objective", "loss_critic", "loss_anchor", "clip_fraction", "kl_approx", "entropy")
         return {name: losses[name].detach().mean() for name in names if name in losses}
 
-    def state(self) -> tuple[Tensors, dict[str, Any]]:
+    def state(self) -> tuple[TensorGroups, dict[str, Any]]:
         """What a checkpoint holds: named tensors, and plain values."""
         tensors = {
             "policy": self.ema_policy.state_dict(),
@@ -189,11 +189,11 @@ class PPOLearner:
             "critic": self.critic.state_dict(),
             "value_norm": self.loss.value_norm.state_dict(),
             "anchor": self.anchor.state_dict(),
-            "optimizer": moments_of(self.optimizer),
+            "optimizer": optimizer_state(self.optimizer),
         }
         return tensors, {"updates": self.updates_done, "averaged": int(self.averaged.n_averaged)}
 
-    def restore(self, tensors: Tensors, values: dict[str, Any]) -> None:
+    def restore(self, tensors: TensorGroups, values: dict[str, Any]) -> None:
         """Go on from what `state` gave.
 
         Raises:
@@ -209,5 +209,5 @@ class PPOLearner:
         for name, module in parts.items():
             module.load_state_dict(tensors[name])
         self.averaged.n_averaged.fill_(values["averaged"])
-        restore_moments(self.optimizer, tensors["optimizer"])
+        restore_optimizer(self.optimizer, tensors["optimizer"])
         self.updates_done = int(values["updates"])

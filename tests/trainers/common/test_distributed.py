@@ -243,7 +243,7 @@ class Spy(Callback):
     def __init__(self, stop_at=None, stops=0):
         self.starts, self.stop_at, self.stops = [], stop_at, stops
 
-    def on_flights(self, index, rollouts):
+    def on_collect(self, index, rollouts):
         """Look at the rollouts."""
         self.starts.append(rollouts["agents", "observation"][:, 0].clone())
         if index == self.stop_at and distributed.rank() == self.stops:

@@ -58,7 +58,7 @@ class _Watch(Callback):
         self.calls.append(("start", tuple(policies)))
         self.policies = policies
 
-    def on_flights(self, index, rollouts):
+    def on_collect(self, index, rollouts):
         self.calls.append(("rollouts", index))
         assert rollouts["agents", "observation"].shape[0] == 8  # flocks of 4: as many agents as 1 of 32
         assert ("agents", "expert_action") in rollouts.keys(include_nested=True)
@@ -106,7 +106,7 @@ def test_any_of_several_callbacks_stops_the_training_and_all_are_called(tmp_path
 @pytest.mark.parametrize("name", ["bc", "dagger"])
 def test_what_a_callback_changes_in_the_flights_is_learned_from(tmp_path, name):
     class Zero(Callback):
-        def on_flights(self, index, rollouts):
+        def on_collect(self, index, rollouts):
             rollouts["agents", "expert_action"].zero_()
 
     losses = []

@@ -172,7 +172,7 @@ def test_actions_shown_are_those_of_the_agents_that_are_flown(watch):
     action = torch.arange(2 * 3 * 4 * 3.0).view(2, 3, 4, 3)
     controlled = torch.ones(2, 3, 4, dtype=torch.bool)
     controlled[..., 0] = False
-    watch.on_flights(7, TensorDict({"agents": {"action": action, "controlled": controlled}}, [2, 3]))
+    watch.on_collect(7, TensorDict({"agents": {"action": action, "controlled": controlled}}, [2, 3]))
     ((step, name, values),) = recorder.histograms
     assert (step, name) == (7, "4/actions")
     assert values.tolist() == action[:, :, 1:].flatten().tolist()
