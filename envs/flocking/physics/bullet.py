@@ -1,8 +1,8 @@
-"""PyBullet as the physics engine: the same controllers as in torch, bodies moved by Bullet, one client for each flock.
+"""PyBullet as the physics engine: the same controllers as in torch, bodies moved by Bullet, one client per flock.
 
-Each agent is a single body with one wrench on it. Without collisions, flights are those of `TorchPhysics`, up to
-rounding. PyBullet is called for each agent and substep, so it is slow; it runs on one core, and several processes
-share the work with `modgnn_rl.envs.parallel.parallel_flocks`.
+Each agent is a single body on which one wrench acts. Without collisions, trajectories equal those of `TorchPhysics` up
+to rounding. PyBullet is called for each agent and substep, so it is slow, and it runs on one core;
+`modgnn_rl.envs.parallel.parallel_flocks` spreads flocks over several processes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from modgnn_rl.envs.flocking.physics.engine import TorchPhysics, fly
+from modgnn_rl.envs.flocking.physics.engine import TorchPhysics, advance
 from modgnn_rl.envs.flocking.physics.quadcopter import Dynamics
 from modgnn_rl.envs.flocking.physics.rigid_body import Bodies
 from modgnn_rl.envs.flocking.physics.vectors import Components, Vector, rotation_matrix, scale, to_body_frame
@@ -26,15 +26,15 @@ from modgnn_rl.errors import InputError
 
 __all__ = ["MAX_CLIENTS", "BulletPhysics", "import_pybullet"]
 
-MAX_CLIENTS = 512  # in a process; each takes 28 MB, and with the 1,025th PyBullet's table is full
-BASE = -1  # what PyBullet calls the only link of a body
+MAX_CLIENTS = 512  # per process; each takes 28 MB, and PyBullet's table holds 1,024
+BASE = -1  # PyBullet's index of a body's only link
 CENTRE = (0.0, 0.0, 0.0)
 FLOOR, AGENT = 1, 2  # collision groups
 WITHOUT_FRICTION = {"lateralFriction": 0, "spinningFriction": 0, "rollingFriction": 0, "restitution": 0}
 
 
 def import_pybullet() -> Any:
-    """PyBullet, without the greeting that it writes to stderr when it is first imported."""
+    """Import PyBullet without the message that it prints to stderr when it is first imported."""
     if "pybullet" not in sys.modules:
         stderr = os.dup(2)
         try:
@@ -54,21 +54,21 @@ class BulletPhysics(TorchPhysics):
     """Quadcopters in PyBullet; see `modgnn_rl.envs.flocking.physics.engine.Physics`.
 
     Bullet differs from `TorchPhysics` only where a body turns by more than pi/4 in a substep: it shortens the turn.
-    State and controllers are float64 on the CPU whatever is emitted.
+    State and controllers are float64 on the CPU, whatever dtype and device are returned.
 
     Args:
-        num_envs: flocks B, each in a client of its own.
+        num_envs: flocks B, each in its own client.
         num_agents: agents N in each.
-        dynamics: how they are controlled and moved.
-        collisions: whether the agents of a flock, spheres as large as the rotors' arms, stop each other, without
-            friction and without bouncing back. As Bullet has it, they may sink into each other by what they fly in a
-            substep, and then part slowly.
-        device: device of the state that is returned.
+        dynamics: parameters of controller and motion.
+        collisions: whether the agents of a flock collide, as spheres with the radius of the rotor arms, without
+            friction or restitution. In Bullet they may penetrate each other by the distance covered in a substep, and
+            then separate slowly.
+        device: device of the returned state.
         dtype: its floating-point type.
 
     Raises:
-        InputError: when the process would hold more than `MAX_CLIENTS` flocks.
-        RuntimeError: later, when a client has been closed or has died; it names the flock.
+        InputError: the process would hold more than `MAX_CLIENTS` flocks.
+        RuntimeError: later, when a client has been closed or has died; the message names the flock.
     """
 
     def __init__(
@@ -84,16 +84,16 @@ class BulletPhysics(TorchPhysics):
         super().__init__(num_envs, num_agents, dynamics, dtype=torch.float64)
         self.collisions = collisions
         self._like = torch.empty((), device=device, dtype=dtype)
-        self._fly = partial(fly, move=self._move)
+        self._advance = partial(advance, move=self._move)
         self._clients: list[int] = []
-        self._disconnect = weakref.finalize(self, _disconnect, self._clients)  # called when it is garbage, and at exit
+        self._disconnect = weakref.finalize(self, _disconnect, self._clients)  # runs on garbage collection and at exit
         for flock in range(num_envs):
             client = bullet.connect(bullet.DIRECT) if flock < MAX_CLIENTS else -1
             if not 0 <= client < MAX_CLIENTS:
                 self.close()
                 raise InputError(
                     f"flock {flock} of {num_envs} would be number {MAX_CLIENTS + 1} in PyBullet in this process; at "
-                    f"most {MAX_CLIENTS} fit: close other environments, or spread flocks over more processes with "
+                    f"most {MAX_CLIENTS} fit: close other environments, or spread flocks over several processes with "
                     "modgnn_rl.envs.parallel.parallel_flocks"
                 )
             self._clients.append(client)
@@ -109,29 +109,29 @@ class BulletPhysics(TorchPhysics):
         quaternion: Tensor | None = None,
         spin: Tensor | None = None,
     ) -> None:
-        """Put the flocks ``rows`` somewhere, see `modgnn_rl.envs.flocking.physics.engine.Physics.reset`."""
+        """Set the state of the flocks ``rows``, see `modgnn_rl.envs.flocking.physics.engine.Physics.reset`."""
         quaternion, spin = (None if part is None else _to_bullet(part) for part in (quaternion, spin))
         super().reset(rows.cpu(), _to_bullet(position), _to_bullet(velocity), quaternion, spin)
         for flock in rows.tolist():
             self._build(flock)
 
     def step(self, target_velocity: Tensor, push: Tensor | None = None) -> None:
-        """Fly one control period, see `modgnn_rl.envs.flocking.physics.engine.Physics.step`."""
+        """Advance one control period, see `modgnn_rl.envs.flocking.physics.engine.Physics.step`."""
         self._settle()
         super().step(_to_bullet(target_velocity), push if push is None else _to_bullet(push))
 
     def restore(self, snapshot: Mapping[str, Tensor]) -> None:
-        """Go on from a snapshot, in worlds built anew, see `modgnn_rl.envs.flocking.physics.engine.Physics.restore`.
+        """Continue from a snapshot in rebuilt worlds, see `modgnn_rl.envs.flocking.physics.engine.Physics.restore`.
 
-        Flights go on bit for bit, also on the floor, except of agents that touch each other at that moment: what Bullet
-        remembers of their contacts is forgotten, and they go on up to rounding (1e-6 m after a second of pushing).
+        Trajectories continue bit for bit, also on the floor, except those of agents in contact with each other: Bullet
+        loses its record of the contacts, so these continue up to rounding (1e-6 m after a second of pushing).
         """
         super().restore(snapshot)
         for flock in range(len(self._clients)):
             self._build(flock)
 
     def compile(self) -> None:
-        """Bullet is compiled already."""
+        """Do nothing: Bullet is compiled code."""
 
     def close(self) -> None:
         """Disconnect the clients; the engine cannot be used any more."""
@@ -142,20 +142,20 @@ class BulletPhysics(TorchPhysics):
 
     @contextmanager
     def _client(self, flock: int) -> Iterator[int]:
-        """The client of a flock, and a clear error where it has gone."""
+        """The client of a flock; an error that names the flock where the client no longer answers."""
         try:
             yield self._clients[flock]
         except (IndexError, bullet.error) as error:
             raise RuntimeError(
-                f"PyBullet no longer moves flock {flock} ({error}): its client was closed or has died; build the "
-                "environment anew"
+                f"PyBullet no longer moves flock {flock} ({error}): its client was closed or has died; create the "
+                "environment again"
             ) from error
 
     def _build(self, flock: int) -> None:
-        """Make the world of a flock anew from its state, so that it remembers nothing, not even contacts."""
+        """Rebuild the world of a flock from its state, without any memory, such as that of contacts."""
         dynamics, vehicle = self.dynamics, self.dynamics.vehicle
         has_shape = self.collisions or dynamics.ground is not None
-        state = (torch.stack(part, -1)[flock].tolist() for part in self.flight.bodies)
+        state = (torch.stack(part, -1)[flock].tolist() for part in self.state.bodies)
         with self._client(flock) as client:
             bullet.resetSimulation(physicsClientId=client)
             bullet.setTimeStep(dynamics.dt, client)
@@ -187,12 +187,12 @@ class BulletPhysics(TorchPhysics):
                 self._bodies[flock].append(body)
 
     def _settle(self) -> None:
-        """Put all bodies where they were last seen.
+        """Set all bodies to the state that was last read.
 
-        Bullet keeps attitudes, but returns them a rounding error off; so a flight would not go on from what is seen of
-        it to the last bit.
+        Bullet returns attitudes that differ from its own by a rounding error; without this, a trajectory would not
+        continue from its emitted state bit for bit.
         """
-        state = [torch.stack(part, -1).tolist() for part in self.flight.bodies]
+        state = [torch.stack(part, -1).tolist() for part in self.state.bodies]
         place, move = bullet.resetBasePositionAndOrientation, bullet.resetBaseVelocity
         for flock, bodies in enumerate(self._bodies):
             with self._client(flock) as client:
@@ -209,7 +209,7 @@ class BulletPhysics(TorchPhysics):
         substeps: int,
         acceleration: Components | None,
     ) -> Bodies:
-        """What `modgnn_rl.envs.flocking.physics.rigid_body.step_bodies` does, by Bullet."""
+        """Bullet's counterpart of `modgnn_rl.envs.flocking.physics.rigid_body.step_bodies`."""
         zero = torch.zeros_like(thrust)
         if acceleration is None:
             return self._step_clients((zero, zero, thrust), torque, substeps)
@@ -222,7 +222,7 @@ class BulletPhysics(TorchPhysics):
     def _step_clients(self, force: Vector, torque: Vector, substeps: int) -> Bodies:
         """Step all flocks under a force, N, and a torque, N m, in the body frame, and read their state.
 
-        PyBullet forgets a wrench after a substep; its own substeps would hold it in the world frame instead.
+        PyBullet clears a wrench after each substep; its own substeps would hold the wrench in the world frame instead.
         """
         push, turn, step = bullet.applyExternalForce, bullet.applyExternalTorque, bullet.stepSimulation
         pose, twist, frame = bullet.getBasePositionAndOrientation, bullet.getBaseVelocity, bullet.LINK_FRAME
@@ -249,7 +249,7 @@ def _to_bullet(value: Tensor) -> Tensor:
 
 
 def _disconnect(clients: list[int]) -> None:
-    """Disconnect clients that still answer, and forget them."""
+    """Disconnect the clients that still answer, and remove them from the list."""
     while clients:
         client = clients.pop()
         if bullet.isConnected(client):

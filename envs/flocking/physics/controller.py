@@ -1,7 +1,7 @@
 """Cascaded velocity controller of a quadcopter: target velocity in, thrust and torque out.
 
-On structures of arrays, see `modgnn_rl.envs.flocking.physics.vectors`. The gains are tuned for a Crazyflie 2.X at 48
-Hz.
+Works on structures of arrays, see `modgnn_rl.envs.flocking.physics.vectors`. The gains are tuned for a Crazyflie 2.X at
+48 Hz.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def velocity_controller(
     gain: float,
     quadcopter: Quadcopter = CRAZYFLIE,
 ) -> tuple[Tensor, Vector, Vector]:
-    """Thrust and torque that steer a quadcopter towards a target velocity.
+    """Compute thrust and torque that steer a quadcopter towards a target velocity.
 
     With ``e = u - v`` and ``I <- clip(I + e dt)``: acceleration ``a = k_p e + 0.2 k_p I`` (clipped), force
     ``F = m (a + g z)``, thrust ``F . R z``; the desired attitude has its z axis along F and yaw 0; the torque is
-    ``J (-150 e_R - 22 w)`` with ``e_R = vee(R_d' R - R' R_d) / 2`` (Lee et al. 2010). The rotors do not limit it yet,
-    see `rotor_limits`.
+    ``J (-150 e_R - 22 w)`` with ``e_R = vee(R_d' R - R' R_d) / 2`` (Lee et al. 2010). The limits of the rotors are not
+    applied here, see `rotor_limits`.
 
     Args:
         target: target velocity u, m/s.
@@ -84,7 +84,7 @@ def velocity_controller(
 
 
 def rotor_limits(thrust: Tensor, torque: Components, quadcopter: Quadcopter = CRAZYFLIE) -> tuple[Tensor, Vector]:
-    """Thrust and torque that four saturating rotors can really give.
+    """Limit thrust and torque to what four saturating rotors can produce.
 
     Args:
         thrust: wanted thrust, N.
@@ -98,7 +98,7 @@ def rotor_limits(thrust: Tensor, torque: Components, quadcopter: Quadcopter = CR
 
 
 def mix_rotors(thrust: Tensor, torque: Components, quadcopter: Quadcopter = CRAZYFLIE) -> Rotors:
-    """Thrusts of the four rotors that give a wrench, each clipped to [0, thrust_to_weight m g / 4], N.
+    """Thrusts of the four rotors that produce a wrench, each clipped to [0, thrust_to_weight m g / 4], N.
 
     Args:
         thrust: wanted thrust, N.

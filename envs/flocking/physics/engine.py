@@ -1,8 +1,8 @@
-"""Physics engines: what moves quadcopters, behind one small interface.
+"""Physics engines behind one small interface, `Physics`.
 
-An engine owns the bodies of ``[B, N]`` quadcopters and their velocity controllers. The environment resets some rows,
-steps all of them with target velocities, and reads positions and velocities; it knows nothing else, so that another
-engine can be added here without touching it.
+An engine owns the bodies of ``[B, N]`` quadcopters and their velocity controllers. The environment resets some flocks,
+steps all of them with target velocities, and reads positions and velocities. It uses nothing else, so an engine can be
+added without changing the environment.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from modgnn_rl.envs.flocking.physics.vectors import Components, Vector, add, rot
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.compile import compiled
 
-__all__ = ["Flight", "Physics", "TorchPhysics", "fly", "make_physics"]
+__all__ = ["SimulationState", "Physics", "TorchPhysics", "advance", "make_physics"]
 
 Move = Callable[[Bodies, Tensor, Vector, Dynamics, int, Components | None], Bodies]
 
@@ -53,41 +53,41 @@ class Physics(Protocol):
         quaternion: Tensor | None = None,
         spin: Tensor | None = None,
     ) -> None:
-        """Put the flocks ``rows`` (indices [R]) somewhere, their rotors at hover thrust.
+        """Set the state of the flocks ``rows``, with rotors at hover thrust and controller integrals at zero.
 
         Args:
-            rows: numbers of flocks, int64 [R].
+            rows: indices of flocks, int64 [R].
             position: m [R, N, 3].
             velocity: m/s [R, N, 3].
-            quaternion: x, y, z, w, of any length [R, N, 4]; default: level.
-            spin: rad/s [R, N, 3]; default: none.
+            quaternion: x, y, z, w, normalised here [R, N, 4]; default: level.
+            spin: rad/s [R, N, 3]; default: zero.
         """
 
     def step(self, target_velocity: Tensor, push: Tensor | None = None) -> None:
-        """Fly one control period.
+        """Advance one control period.
 
         Args:
             target_velocity: m/s [B, N, 3].
-            push: acceleration from outside, such as wind, m/s^2, broadcast to [B, N, 3].
+            push: external acceleration, such as wind, m/s^2, broadcast to [B, N, 3].
         """
 
     def snapshot(self) -> dict[str, Tensor]:
-        """A copy of all that flights continue from, by name [B, N, C], in the precision that the engine computes in."""
+        """A copy of the complete state, by name [B, N, C], in the precision in which the engine computes."""
 
     def restore(self, snapshot: Mapping[str, Tensor]) -> None:
-        """Go on from a copy of what `snapshot` gave, whatever device it is on."""
+        """Continue from a snapshot, whatever device it is on."""
 
     def close(self) -> None:
-        """Free what the engine holds."""
+        """Free the engine's resources."""
 
 
-class Flight(NamedTuple):
-    """State of quadcopters in flight, as structures of arrays.
+class SimulationState(NamedTuple):
+    """State of quadcopters and their controllers, as structures of arrays: tuples of components [B, N].
 
     Attributes:
         bodies: position, attitude and motion.
         integral: integrated velocity error of the controller, m.
-        rotors: thrusts of the rotors, N; empty where they follow their commands at once.
+        rotors: thrusts of the rotors, N; empty where the rotors follow their commands without lag.
     """
 
     bodies: Bodies
@@ -101,8 +101,8 @@ class TorchPhysics:
     Args:
         num_envs: flocks B.
         num_agents: agents N in each.
-        dynamics: how they are controlled and moved.
-        device: where the state lives.
+        dynamics: parameters of controller and motion.
+        device: device of the state.
         dtype: floating-point type of the state.
     """
 
@@ -116,32 +116,32 @@ class TorchPhysics:
         dtype: torch.dtype = torch.float32,
     ) -> None:
         self.dynamics = dynamics or Dynamics()
-        self._fly = fly
+        self._advance = advance
         zero = torch.zeros(num_envs, num_agents, device=device, dtype=dtype)
         nothing = (zero, zero, zero)
         hover = torch.full_like(zero, self.dynamics.vehicle.hover_thrust)
         rotors = (hover, hover, hover, hover) if self.dynamics.motor_lag else ()
-        self.flight = Flight(Bodies(nothing, (*nothing, torch.ones_like(zero)), nothing, nothing), nothing, rotors)
+        self.state = SimulationState(Bodies(nothing, (*nothing, torch.ones_like(zero)), nothing, nothing), nothing, rotors)
 
     @property
     def position(self) -> Tensor:
         """Positions, m [B, N, 3]."""
-        return self._emit(self.flight.bodies.position)
+        return self._emit(self.state.bodies.position)
 
     @property
     def quaternion(self) -> Tensor:
         """Attitudes from body to world, x, y, z, w [B, N, 4]."""
-        return self._emit(self.flight.bodies.quaternion)
+        return self._emit(self.state.bodies.quaternion)
 
     @property
     def velocity(self) -> Tensor:
         """Velocities, m/s [B, N, 3]."""
-        return self._emit(self.flight.bodies.velocity)
+        return self._emit(self.state.bodies.velocity)
 
     @property
     def spin(self) -> Tensor:
         """Angular velocities, rad/s [B, N, 3]."""
-        return self._emit(self.flight.bodies.spin)
+        return self._emit(self.state.bodies.spin)
 
     def reset(
         self,
@@ -151,69 +151,69 @@ class TorchPhysics:
         quaternion: Tensor | None = None,
         spin: Tensor | None = None,
     ) -> None:
-        """Put the flocks ``rows`` somewhere, see `Physics.reset`."""
+        """Set the state of the flocks ``rows``, see `Physics.reset`."""
         nothing = torch.zeros_like(position)
         level = torch.cat((nothing, torch.ones_like(position[..., :1])), -1)
         hover = torch.full_like(level, self.dynamics.vehicle.hover_thrust)
-        bodies, integral, rotors = self.flight
+        bodies, integral, rotors = self.state
         attitude = level if quaternion is None else quaternion / quaternion.norm(dim=-1, keepdim=True)
         fresh = (position, attitude, velocity, nothing if spin is None else spin)
-        self.flight = Flight(
+        self.state = SimulationState(
             Bodies(*(_replace(old, rows, new) for old, new in zip(bodies, fresh, strict=True))),
             _replace(integral, rows, nothing),
             _replace(rotors, rows, hover) if rotors else (),
         )
 
     def step(self, target_velocity: Tensor, push: Tensor | None = None) -> None:
-        """Fly one control period, see `Physics.step`."""
+        """Advance one control period, see `Physics.step`."""
         air = None if push is None else push.unbind(-1)
-        self.flight = self._fly(self.flight, target_velocity.unbind(-1), air, self.dynamics)
+        self.state = self._advance(self.state, target_velocity.unbind(-1), air, self.dynamics)
 
     def snapshot(self) -> dict[str, Tensor]:
         """A copy of the state, see `Physics.snapshot`."""
-        bodies, integral, rotors = self.flight
+        bodies, integral, rotors = self.state
         parts = {**bodies._asdict(), "integral": integral, **({"rotors": rotors} if rotors else {})}
         return {name: torch.stack(tuple(part), -1) for name, part in parts.items()}
 
     def restore(self, snapshot: Mapping[str, Tensor]) -> None:
-        """Go on from a snapshot, see `Physics.restore`."""
-        device = self.flight.integral[0].device
-        # Components are contiguous, as after a step: the same arithmetic, to the last bit, and no new compiling.
+        """Continue from a snapshot, see `Physics.restore`."""
+        device = self.state.integral[0].device
+        # Components are contiguous, as after a step: the same arithmetic, bit for bit, and no recompilation.
         parts: dict[str, Any] = {
             name: tuple(part.to(device).clone(memory_format=torch.contiguous_format) for part in value.unbind(-1))
             for name, value in snapshot.items()
         }
         bodies = Bodies(*(parts[name] for name in Bodies._fields))
-        self.flight = Flight(bodies, parts["integral"], parts.get("rotors", ()))
+        self.state = SimulationState(bodies, parts["integral"], parts.get("rotors", ()))
 
     def compile(self) -> None:
         """Compile a control period into one function."""
-        self._fly = compiled(fly)
+        self._advance = compiled(advance)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there is nothing to free."""
 
     def _emit(self, components: Components) -> Tensor:
         """A part of the state as a tensor [B, N, C]."""
         return torch.stack(tuple(components), -1)
 
 
-def fly(
-    flight: Flight, target: Components, push: Components | None, dynamics: Dynamics, move: Move = step_bodies
-) -> Flight:
-    """One control period: the controller once, then the rigid bodies in substeps, as a pure function.
+def advance(
+    state: SimulationState, target: Components, push: Components | None, dynamics: Dynamics, move: Move = step_bodies
+) -> SimulationState:
+    """Advance one control period: the controller once, then the rigid bodies in substeps. A pure function.
 
     Args:
-        flight: the state.
+        state: the current state.
         target: target velocity, m/s.
-        push: acceleration from outside, m/s^2.
-        dynamics: how quadcopters are controlled and moved.
-        move: what moves rigid bodies, with the arguments of `modgnn_rl.envs.flocking.physics.rigid_body.step_bodies`.
+        push: external acceleration, m/s^2.
+        dynamics: parameters of controller and motion.
+        move: integrates rigid bodies; same arguments as `modgnn_rl.envs.flocking.physics.rigid_body.step_bodies`.
 
     Returns:
         the new state.
     """
-    bodies, integral, rotors = flight
+    bodies, integral, rotors = state
     rotation = rotation_matrix(bodies.quaternion)
     rate = to_body_frame(rotation, bodies.spin)
     thrust, torque, integral = velocity_controller(
@@ -222,7 +222,7 @@ def fly(
     commands = mix_rotors(thrust, torque, dynamics.vehicle)
     if not rotors and not dynamics.drag:
         wrench = rotor_wrench(commands, dynamics.vehicle)
-        return Flight(move(bodies, *wrench, dynamics, dynamics.substeps, push), integral, ())
+        return SimulationState(move(bodies, *wrench, dynamics, dynamics.substeps, push), integral, ())
     for _ in range(dynamics.substeps):
         thrusts = _follow(rotors, commands, dynamics.lag) if rotors else commands
         rotors = thrusts if rotors else ()
@@ -231,17 +231,17 @@ def fly(
             pushed = rotor_drag(bodies, thrusts, dynamics)
             pushed = pushed if push is None else add(pushed, push)
         bodies = move(bodies, *rotor_wrench(thrusts, dynamics.vehicle), dynamics, 1, pushed)
-    return Flight(bodies, integral, rotors)
+    return SimulationState(bodies, integral, rotors)
 
 
 def _follow(rotors: Rotors, commands: Rotors, lag: float) -> Rotors:
-    """Thrusts of rotors after a physics step, a share ``lag`` of the difference from their commands being left."""
+    """Thrusts of the rotors after a physics step; the fraction ``lag`` of the difference from the commands remains."""
     first, second, third, fourth = (c + lag * (f - c) for f, c in zip(rotors, commands, strict=True))
     return first, second, third, fourth
 
 
 def _replace(old: Components, rows: Tensor, new: Tensor) -> Any:
-    """Components [B, N] with those of the flocks ``rows`` taken from ``new`` [R, N, C]."""
+    """Components [B, N], with those of the flocks ``rows`` replaced by ``new`` [R, N, C]."""
     return tuple(part.index_copy(0, rows, value) for part, value in zip(old, new.unbind(-1), strict=True))
 
 
@@ -251,7 +251,7 @@ def make_physics(
     """Build the engine that ``config.physics`` names for B flocks of N agents.
 
     Raises:
-        InputError: when it does not have what the configuration asks of it.
+        InputError: the engine does not support a setting.
     """
     dynamics = Dynamics(
         period=1 / config.control_frequency,
@@ -264,7 +264,7 @@ def make_physics(
         ground=config.ground,
     )
     if config.physics == "bullet":
-        from modgnn_rl.envs.flocking.physics.bullet import BulletPhysics  # imports pybullet, which nothing else needs
+        from modgnn_rl.envs.flocking.physics.bullet import BulletPhysics  # here, because it imports pybullet
 
         return BulletPhysics(num_envs, num_agents, dynamics, collisions=config.collisions, device=device, dtype=dtype)
     if config.collisions:

@@ -1,4 +1,4 @@
-"""Constants of the vehicle, and how it is flown."""
+"""Constants of the vehicle, and parameters of its controller and motion."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CRAZYFLIE = Quadcopter()
 
 @dataclass(frozen=True)
 class Dynamics:
-    """How quadcopters are controlled and moved; see the fields of the same names of `FlockingConfig`.
+    """Parameters of controller and motion; see the fields of `FlockingConfig` with the same names.
 
     Attributes:
         period: control period, s.
@@ -73,5 +73,5 @@ class Dynamics:
 
     @property
     def lag(self) -> float:
-        """What is left of a difference between a rotor's thrust and its command after a physics step."""
+        """Fraction of a difference between a rotor's thrust and its command that remains after a physics step."""
         return math.exp(-self.dt / self.motor_lag) if self.motor_lag else 0.0

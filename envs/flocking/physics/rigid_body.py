@@ -1,4 +1,4 @@
-"""Rigid-body motion in semi-implicit steps, written as Bullet computes it, on structures of arrays."""
+"""Rigid-body motion in semi-implicit steps, in the order of Bullet's computation, on structures of arrays."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from modgnn_rl.envs.flocking.physics.vectors import (
 
 __all__ = ["Bodies", "rotor_drag", "step_bodies"]
 
-# What Bullet's solver does with a contact, found by experiment.
+# Parameters of contacts in Bullet's solver, found by experiment.
 CONTACT_MARGIN = 0.02 * 3**0.5  # of the radius: of the half diagonal of the box around the sphere
 CONTACT_SLOP = 1e-5  # m
-CONTACT_CORRECTION = 0.08  # share of a penetration that a step takes back
+CONTACT_CORRECTION = 0.08  # fraction of a penetration that a step corrects
 TINY_ANGLE = 1e-9  # rad
 
 
@@ -63,7 +63,7 @@ def step_bodies(
         w = R' W;  alpha = J^-1 (torque - w x J w) - d_a w (1 + |w|)
         v += dt (R z thrust / m - g z + a - d v (1 + |v|));  W += dt R alpha;  p += dt v;  q <- exp(W dt) q
 
-    with the damping d of velocities and d_a of angular velocities. A floor keeps v_z as `_stay_above` says.
+    with the damping d of velocities and d_a of angular velocities. A floor limits v_z, see `_stay_above`.
 
     Args:
         bodies: the state.
@@ -71,10 +71,10 @@ def step_bodies(
         torque: torque in the body frame, N m.
         dynamics: length of a substep, damping, floor, vehicle.
         substeps: number of substeps.
-        acceleration: further acceleration a in the world frame, m/s^2.
+        acceleration: external acceleration a in the world frame, m/s^2.
 
     Returns:
-        the new state, its quaternions normalised.
+        the new state, with normalised quaternions.
     """
     position, quaternion, velocity, spin = bodies
     vehicle, dt = dynamics.vehicle, dynamics.dt
@@ -143,10 +143,11 @@ def _damping(velocity: Vector, damping: float) -> Vector:
 
 
 def _stay_above(position: Vector, velocity: Vector, dynamics: Dynamics) -> Vector:
-    """Velocities after contact of a sphere with a floor, without friction and bouncing, as Bullet's solver has them.
+    """Velocities after contact of a sphere with a floor, without friction or restitution, as in Bullet's solver.
 
-    A contact exists where the gap before the step is below the margin. There the velocity is at least what closes the
-    gap in one step, or what takes back a share of the penetration; Bullet counts both from a little below the floor.
+    A contact exists where the gap before the step is below the margin. There, the vertical velocity is at least the one
+    that closes the gap in one step, or that corrects a fraction of the penetration; both are measured from a level
+    `CONTACT_SLOP` below the floor.
     """
     assert dynamics.ground is not None
     radius = dynamics.vehicle.arm
@@ -158,7 +159,7 @@ def _stay_above(position: Vector, velocity: Vector, dynamics: Dynamics) -> Vecto
 
 
 def _rotate(quaternion: Quaternion, spin: Vector, dt: float) -> Quaternion:
-    """exp(W dt) q: the quaternions after turning with world-frame angular velocities for dt seconds."""
+    """exp(W dt) q: the quaternions after rotation with world-frame angular velocities for dt seconds."""
     half = norm(spin) * (0.5 * dt)
     # sin(x) / x, which is 1 in floating point where x is tiny.
     vector = scale(0.5 * dt * torch.where(half > TINY_ANGLE, half.sin() / half, 1.0), spin)

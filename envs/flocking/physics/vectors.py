@@ -1,8 +1,8 @@
 """Vector algebra on structures of arrays.
 
-A vector is a tuple of its components, one tensor each; a quaternion is x, y, z, w. So every operation is pointwise over
-flocks and agents: fast on a CPU, and one loop when compiled. Wherever a vector is read, a tensor whose first dimension
-holds the components will do.
+A vector is a tuple of its components, one tensor each; a quaternion is x, y, z, w. Every operation is pointwise over
+flocks and agents: fast on a CPU, and one loop when compiled. Functions also accept a tensor whose first dimension holds
+the components.
 """
 
 from __future__ import annotations

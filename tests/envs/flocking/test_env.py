@@ -368,8 +368,8 @@ def test_staggered_flocks_end_their_first_episode_at_any_step() -> None:
 def snapshot(env: FlockingEnv) -> dict[str, Tensor]:
     physics = env.physics
     assert isinstance(physics, TorchPhysics)
-    state = {name: torch.stack(part, -1) for name, part in physics.flight.bodies._asdict().items()}
-    integral = torch.stack(physics.flight.integral, -1)
+    state = {name: torch.stack(part, -1) for name, part in physics.state.bodies._asdict().items()}
+    integral = torch.stack(physics.state.integral, -1)
     return state | {"integral": integral, "leader": env.target_velocity[:, 0].clone(), "steps": env.step_count.clone()}
 
 
@@ -434,7 +434,7 @@ def test_what_is_worth_it_is_compiled(how: str, monkeypatch: pytest.MonkeyPatch)
         env = FlockingEnv(2, 3, seed=0, config=FlockingConfig(compile=True))
     else:
         env = FlockingEnv(2, 3, seed=0).compile()
-    assert sorted(names) == ["fly", "hear_all_pairs", "judge"]
+    assert sorted(names) == ["advance", "hear_all_pairs", "judge"]
     check_env_specs(env)
 
 

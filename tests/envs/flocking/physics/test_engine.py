@@ -256,7 +256,7 @@ def test_reset_puts_flocks_level_and_leaves_the_others() -> None:
     engine = TorchPhysics(4, 2, dtype=torch.float64)
     for step in range(20):
         engine.step(random_targets(4, 2, seed=step, speed=3))
-    before = engine.flight
+    before = engine.state
     position, velocity = random_targets(2, 2, seed=100), random_targets(2, 2, seed=101)
     engine.reset(torch.tensor([2, 0]), position, velocity)
     assert torch.equal(engine.position[[2, 0]], position)
@@ -264,10 +264,10 @@ def test_reset_puts_flocks_level_and_leaves_the_others() -> None:
     level = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)
     assert torch.equal(engine.quaternion[[0, 2]], level.expand(2, 2, 4))
     assert not engine.spin[[0, 2]].any()
-    assert not stack(engine.flight.integral)[:, [0, 2]].any()
+    assert not stack(engine.state.integral)[:, [0, 2]].any()
     assert stack(before.integral).all()
     for old, new in zip(
-        (*before.bodies, before.integral), (*engine.flight.bodies, engine.flight.integral), strict=True
+        (*before.bodies, before.integral), (*engine.state.bodies, engine.state.integral), strict=True
     ):
         assert torch.equal(stack(old)[:, [1, 3]], stack(new)[:, [1, 3]])
 
