@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, MarlGroupMapType
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, as_list
 from modgnn_rl.configs.settings import check
-from modgnn_rl.envs.flocking.faults import Faults
+from modgnn_rl.envs.flocking.perturbations import Perturbations
 from modgnn_rl.envs.flocking.leader import make_leader
 from modgnn_rl.envs.flocking.nonfinite import complaint, lost_flocks, unusable
 from modgnn_rl.envs.flocking.physics.engine import TorchPhysics, make_physics
@@ -29,7 +29,7 @@ from modgnn_rl.utils.tensors import clip_to_ball
 
 __all__ = ["FlockingEnv", "checked_config"]
 
-PARTS = ("physics", "leader", "faults")  # what has a state of its own
+PARTS = ("physics", "leader", "perturbations")  # what has a state of its own
 AWAY = 1e4  # m; where agents that do not exist are kept, as far from each other
 
 
@@ -109,7 +109,7 @@ class FlockingEnv(EnvBase):
         self.is_mixed = not bool(self.exists.all())
         self.physics = make_physics(self.config, num_envs, self.num_agents, self.device, dtype)
         self.leader = make_leader(self.config, num_envs, self.device, dtype)
-        self.faults = Faults(self.config, num_envs, self.num_agents, self.device, dtype)
+        self.perturbations = Perturbations(self.config, num_envs, self.num_agents, self.device, dtype)
         self.target_velocity = torch.zeros(num_envs, self.num_agents, 3, device=self.device, dtype=dtype)
         self.step_count = torch.zeros(num_envs, 1, device=self.device, dtype=torch.long)
         self._hear_all_pairs, self._judge = hear_all_pairs, judge
@@ -166,7 +166,7 @@ class FlockingEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.generator.manual_seed(seed)
-            self.faults.generator.manual_seed(derive_seed(seed, "faults"))
+            self.perturbations.generator.manual_seed(derive_seed(seed, "faults"))
 
     def _reset(self, tensordict: TensorDictBase | None, *, set_state: bool = False, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -188,7 +188,7 @@ class FlockingEnv(EnvBase):
             )
         position, velocity = self.physics.position, self.physics.velocity
         state = torch.cat((position, velocity), -1)
-        self.faults.reset(mask, state)
+        self.perturbations.reset(mask, state)
         return self._emit(state, self._hear(position)[0], is_new=False).update(self.full_done_spec.zero())
 
     def _start(self, rows: Tensor) -> Tensor:
@@ -236,7 +236,7 @@ class FlockingEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         config = self.config
-        push = self.faults.step()
+        push = self.perturbations.step()
         flown = self._controlled()
         before = self.physics.position, self.physics.velocity
         action = self._checked_action(tensordict["agents", "action"])
@@ -276,33 +276,33 @@ class FlockingEnv(EnvBase):
 
     def _controlled(self) -> Tensor:
         """The agents that the policy flies now, bool [B, N]."""
-        controlled = self.exists & self.faults.running
+        controlled = self.exists & self.perturbations.running
         controlled[:, 0] = False
         return controlled
 
     def _hear(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """The graph, and the distance of the nearest other agent, m [B, N]."""
-        config, faults = self.config, self.faults
-        taking_part = self.exists & faults.running if self.has_mask else None
+        config, perturbations = self.config, self.perturbations
+        taking_part = self.exists & perturbations.running if self.has_mask else None
         if config.graph == "links":
             if self.is_mixed:
                 position = position.masked_fill(~self.exists.unsqueeze(-1), torch.nan)
-            return hear_near_pairs(position, faults, taking_part, self._nearby, self._room)
-        reach = config.comm_range if faults.reach is None else faults.reach
+            return hear_near_pairs(position, perturbations, taking_part, self._nearby, self._room)
+        reach = config.comm_range if perturbations.reach is None else perturbations.reach
         adjacency, nearest = self._hear_all_pairs(position, reach)
         if taking_part is not None:
             adjacency &= taking_part.unsqueeze(-1) & taking_part.unsqueeze(-2)
-        arrived = faults.arrived(*adjacency.shape)
+        arrived = perturbations.arrived(*adjacency.shape)
         return adjacency if arrived is None else adjacency & arrived, nearest
 
     def _emit(self, state: Tensor, adjacency: Tensor, *, is_new: bool = True) -> TensorDict:
         if self.is_mixed:
             state = state.masked_fill(~self.exists.unsqueeze(-1), 0.0)
-        agents = {"observation": self.faults.observe(state, is_new=is_new), "controlled": self._controlled()}
+        agents = {"observation": self.perturbations.observe(state, is_new=is_new), "controlled": self._controlled()}
         if self.config.hides_state:
             agents["state"] = state
         if self.has_mask:
-            agents["mask"] = self.exists & self.faults.running
+            agents["mask"] = self.exists & self.perturbations.running
         return TensorDict(
             {"agents": TensorDict(agents, self.batch_size, device=self.device), "adjacency": adjacency},
             self.batch_size,
@@ -319,7 +319,7 @@ class FlockingEnv(EnvBase):
         return action.to(self.dtype)
 
     def snapshot(self) -> dict[str, Tensor]:
-        """A copy of all that the rollouts continue from, but for `generator` and ``faults.generator``.
+        """A copy of all that the rollouts continue from, but for `generator` and ``perturbations.generator``.
 
         Returns:
             by name, such as ``"physics.position"`` [B, N, 3] or ``"step_count"`` [B, 1].

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from modgnn_rl.envs.flocking.faults import Faults
+from modgnn_rl.envs.flocking.perturbations import Perturbations
 from modgnn_rl.envs.flocking.neighbours import link_list, near_pairs
 from modgnn_rl.utils.tensors import pair_distances
 
@@ -30,7 +30,7 @@ def hear_all_pairs(position: Tensor, reach: Tensor | float) -> tuple[Tensor, Ten
 
 
 def hear_near_pairs(
-    position: Tensor, faults: Faults, heard: Tensor | None, nearby: float, room: int
+    position: Tensor, perturbations: Perturbations, heard: Tensor | None, nearby: float, room: int
 ) -> tuple[Tensor, Tensor]:
     """The same with memory for the links alone, faults included.
 
@@ -49,14 +49,16 @@ def hear_near_pairs(
         InputError: where a flock has more links.
     """
     flocks, agents = position.shape[:2]
-    reach = faults.config.comm_range * (1 + faults.config.range_spread)
+    reach = perturbations.config.comm_range * (1 + perturbations.config.range_spread)
     flock, receiver, sender, distance = near_pairs(position, max(reach, nearby))
     nearest = torch.full((flocks * agents,), torch.inf, dtype=position.dtype, device=position.device)
     nearest.scatter_reduce_(0, flock * agents + receiver, distance, "amin")
-    hears = distance <= (faults.config.comm_range if faults.reach is None else faults.reach[flock, sender])
+    hears = distance <= (
+        perturbations.config.comm_range if perturbations.reach is None else perturbations.reach[flock, sender]
+    )
     if heard is not None:
         hears &= heard[flock, sender] & heard[flock, receiver]
-    arrived = faults.arrived(len(hears))
+    arrived = perturbations.arrived(len(hears))
     if arrived is not None:
         hears &= arrived
     links = link_list(flock[hears], receiver[hears], sender[hears], flocks, room)

@@ -71,7 +71,7 @@ class FlockCollector:
     @property
     def generators(self) -> dict[str, torch.Generator]:
         """All that draws at random here, by name."""
-        return {"env": self.env.generator, "faults": self.env.faults.generator, "noise": self.noise}
+        return {"env": self.env.generator, "faults": self.env.perturbations.generator, "noise": self.noise}
 
     def state(self) -> tuple[TensorGroups, dict[str, Any]]:
         """What a checkpoint holds of the rollouts."""

@@ -168,7 +168,7 @@ class WorkerCollector(Collector):
     @property
     def _generators(self) -> dict[str, torch.Generator]:
         env = self.env.base_env
-        return {"env": env.generator, "faults": env.faults.generator, **_generators_of(self.policy)}
+        return {"env": env.generator, "faults": env.perturbations.generator, **_generators_of(self.policy)}
 
     @property
     def _mixtures(self) -> dict[str, BetaMixture]:

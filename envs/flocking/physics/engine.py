@@ -121,7 +121,9 @@ class TorchPhysics:
         nothing = (zero, zero, zero)
         hover = torch.full_like(zero, self.dynamics.vehicle.hover_thrust)
         rotors = (hover, hover, hover, hover) if self.dynamics.motor_lag else ()
-        self.state = SimulationState(Bodies(nothing, (*nothing, torch.ones_like(zero)), nothing, nothing), nothing, rotors)
+        self.state = SimulationState(
+            Bodies(nothing, (*nothing, torch.ones_like(zero)), nothing, nothing), nothing, rotors
+        )
 
     @property
     def position(self) -> Tensor:

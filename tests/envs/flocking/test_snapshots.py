@@ -50,13 +50,13 @@ def rollout(env: FlockingEnv, td: TensorDictBase, steps: int) -> tuple[list[Tens
 
 
 def generators(env: FlockingEnv) -> list[Tensor]:
-    return [env.generator.get_state(), env.faults.generator.get_state()]
+    return [env.generator.get_state(), env.perturbations.generator.get_state()]
 
 
 def resume(env: FlockingEnv, snapshot: dict[str, Tensor], states: list[Tensor]) -> None:
     env.restore(snapshot)
     env.generator.set_state(states[0])
-    env.faults.generator.set_state(states[1])
+    env.perturbations.generator.set_state(states[1])
 
 
 def assert_equal(rollout: list[TensorDictBase], other: list[TensorDictBase]) -> None:
@@ -130,16 +130,16 @@ def test_names() -> None:
         "target_velocity",
         *(f"physics.{name}" for name in bodies),
         "leader.velocity",
-        *(f"faults.{name}" for name in ("running", "reach", "gust", "late")),
+        *(f"perturbations.{name}" for name in ("running", "reach", "gust", "late")),
     }
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_envs": 2}, r"its faults\.gust is float32 \[2, 1, 3\], that of this environment is float32 \[3, 1, 3\]"),
-        ({"num_agents": 4}, r"faults\.late is float32 \[0, 3, 4, 6\]"),
-        ({"delay": 2}, r"faults\.late is float32 \[2, 3, 5, 6\]"),
+        ({"num_envs": 2}, r"its perturbations\.gust is float32 \[2, 1, 3\], that of this environment is float32 \[3, 1, 3\]"),
+        ({"num_agents": 4}, r"perturbations\.late is float32 \[0, 3, 4, 6\]"),
+        ({"delay": 2}, r"perturbations\.late is float32 \[2, 3, 5, 6\]"),
         ({"num_agents": [2, 5]}, r"its sizes is \[2, 5, 2\], that of this environment is \[5, 5, 5\]"),
         ({"leader": "circle"}, r"its leader\.heading is float32 \[3, 1\], that of this environment is absent"),
         ({"motor_lag": 0.05}, r"physics\.rotors is float32 \[3, 5, 4\], that of this environment is absent"),

@@ -16,10 +16,10 @@ from torch import Tensor
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking.snapshots import Stateful
 
-__all__ = ["Faults"]
+__all__ = ["Perturbations"]
 
 
-class Faults(Stateful):
+class Perturbations(Stateful):
     """The faults of B flocks of N agents; see the settings of `FlockingConfig` that begin with "fault:".
 
     Attributes:
