@@ -104,7 +104,7 @@ def loops(envs: int, agents: int, compile: bool) -> Iterator[tuple[str, Loop]]:
     def fly_world() -> int:
         fly_physics()
         position, velocity = env.physics.position, env.physics.velocity
-        env._hear(position)
+        env.communication_graph(position)
         expert.rule(position, velocity)
         return 1
 

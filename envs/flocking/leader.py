@@ -1,4 +1,4 @@
-"""Leaders: how agent 0 of a flock flies, whatever the policy says."""
+"""Leaders: the trajectories of agent 0 of each flock, which the policy does not control."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from modgnn_rl.utils.tensors import clip_to_ball
 
 __all__ = ["CircleLeader", "Leader", "NoiseLeader", "WaypointLeader", "make_leader"]
 
-ARRIVED = 0.3  # m from a waypoint
+ARRIVED = 0.3  # m; a waypoint counts as reached within this distance
 
 
 class Leader(Stateful, ABC):
     """The target velocities of the leaders of B flocks.
 
     Args:
-        config: the world.
+        config: settings of the environment.
         num_envs: flocks B.
-        device: where they are.
+        device: device of the state.
         dtype: floating-point type.
     """
 
@@ -32,15 +32,15 @@ class Leader(Stateful, ABC):
 
     @abstractmethod
     def reset(self, mask: Tensor, generator: torch.Generator) -> None:
-        """Begin anew in the flocks of the mask, bool [B, 1]."""
+        """Start a new trajectory in the flocks of the mask, bool [B, 1]."""
 
     @abstractmethod
     def step(self, position: Tensor, generator: torch.Generator) -> Tensor:
         """The target velocity for the next control period, m/s [B, 3].
 
         Args:
-            position: where the leaders are, m [B, 3].
-            generator: source of randomness; it draws the same numbers wherever they are.
+            position: of the leaders, m [B, 3].
+            generator: source of randomness; the numbers sampled do not depend on the positions.
         """
 
 
@@ -66,7 +66,7 @@ class NoiseLeader(Leader):
 
 
 class WaypointLeader(Leader):
-    """Straight to a waypoint at ``leader_speed``, then to the next: uniform in the ball of ``leader_radius``."""
+    """Straight lines at ``leader_speed`` between waypoints, which are uniform in the ball of ``leader_radius``."""
 
     STATE = ("waypoint",)
 
@@ -75,23 +75,23 @@ class WaypointLeader(Leader):
         self.waypoint = self.zero
 
     def reset(self, mask: Tensor, generator: torch.Generator) -> None:
-        """Choose a first waypoint."""
-        self.waypoint = torch.where(mask, self._draw(generator), self.waypoint)
+        """Sample the first waypoint."""
+        self.waypoint = torch.where(mask, self._sample(generator), self.waypoint)
 
     def step(self, position: Tensor, generator: torch.Generator) -> Tensor:
-        """Head for the waypoint, or for a new one."""
+        """Move towards the waypoint, or towards a new one if it has been reached."""
         arrived = torch.linalg.vector_norm(self.waypoint - position, dim=-1, keepdim=True) < ARRIVED
-        self.waypoint = torch.where(arrived, self._draw(generator), self.waypoint)
+        self.waypoint = torch.where(arrived, self._sample(generator), self.waypoint)
         return self.config.leader_speed * torch.nn.functional.normalize(self.waypoint - position, dim=-1)
 
-    def _draw(self, generator: torch.Generator) -> Tensor:
+    def _sample(self, generator: torch.Generator) -> Tensor:
         direction = torch.nn.functional.normalize(_normal(self.zero, generator), dim=-1)
-        share = torch.rand(len(self.zero), 1, generator=generator, device=self.zero.device, dtype=self.zero.dtype)
-        return self.config.leader_radius * share.pow(1 / 3) * direction
+        fraction = torch.rand(len(self.zero), 1, generator=generator, device=self.zero.device, dtype=self.zero.dtype)
+        return self.config.leader_radius * fraction.pow(1 / 3) * direction
 
 
 class CircleLeader(Leader):
-    """A level circle of ``leader_radius`` at ``leader_speed``, begun in a random direction."""
+    """A horizontal circle of ``leader_radius`` at ``leader_speed``, with a random initial heading."""
 
     STATE = ("heading",)
 
@@ -101,12 +101,12 @@ class CircleLeader(Leader):
         self.turn = config.leader_speed / config.leader_radius / config.control_frequency
 
     def reset(self, mask: Tensor, generator: torch.Generator) -> None:
-        """Choose a heading, rad."""
-        drawn = torch.rand(self.heading.shape, generator=generator, device=self.zero.device, dtype=self.zero.dtype)
-        self.heading = torch.where(mask, 2 * torch.pi * drawn, self.heading)
+        """Sample the heading, rad."""
+        turns = torch.rand(self.heading.shape, generator=generator, device=self.zero.device, dtype=self.zero.dtype)
+        self.heading = torch.where(mask, 2 * torch.pi * turns, self.heading)
 
     def step(self, position: Tensor, generator: torch.Generator) -> Tensor:
-        """Turn a little."""
+        """Advance along the circle."""
         velocity = torch.cat((self.heading.cos(), self.heading.sin(), torch.zeros_like(self.heading)), -1)
         self.heading = self.heading + self.turn
         return self.config.leader_speed * velocity
@@ -120,5 +120,5 @@ LEADERS: dict[str, type[Leader]] = {"noise": NoiseLeader, "waypoints": WaypointL
 
 
 def make_leader(config: FlockingConfig, num_envs: int, device: torch.device, dtype: torch.dtype) -> Leader:
-    """The leader that ``config.leader`` names."""
+    """Create the leader that ``config.leader`` names."""
     return LEADERS[config.leader](config, num_envs, device, dtype)

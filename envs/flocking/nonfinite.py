@@ -1,4 +1,4 @@
-"""Numbers that nothing can be computed with any more: finding them, at the cost of one reduction, and naming them."""
+"""Detection of NaN, infinite and overflowing values in states and actions, at the cost of one reduction."""
 
 from __future__ import annotations
 
@@ -9,49 +9,52 @@ from torch import Tensor
 
 from modgnn_rl.errors import NotFinite
 
-__all__ = ["complaint", "lost_flocks", "unusable"]
+__all__ = ["check_finite", "nonfinite_agents", "nonfinite_message"]
 
 REMEDIES = {
-    "action": "a policy must give three finite numbers, m/s",
+    "action": "a policy must return three finite numbers (m/s)",
     "state": "lower gains and dampings or raise env.physics_substeps",
 }
 
 
-def lost_flocks(
+def check_finite(
     name: str, value: Tensor, step_count: Tensor, on_nonfinite: str, counts: Tensor | None = None
 ) -> list[int]:
-    """Find the flocks that cannot fly on, and warn of them or stop.
+    """Find the flocks that have to restart because of a value that cannot be computed with.
 
     Args:
         name: what the values are, one of `REMEDIES`.
-        value: of agents [B, N, D].
-        step_count: steps that each flock has flown [B, 1].
+        value: one vector per agent [B, N, D].
+        step_count: steps since each flock's reset [B, 1].
         on_nonfinite: "stop" or "restart", see `modgnn_rl.configs.schema.FlockingConfig`.
-        counts: agents that count, bool [B, N]; default: all.
+        counts: agents to check, bool [B, N]; default: all.
+
+    Returns:
+        indices of the flocks to restart; a RuntimeWarning names the first.
 
     Raises:
-        NotFinite: there are some, and ``on_nonfinite="stop"``.
+        NotFinite: there is such a value, and ``on_nonfinite="stop"``.
     """
-    bad = unusable(value, counts)
+    bad = nonfinite_agents(value, counts)
     if bad is None:
         return []
-    reason = complaint(name, value, bad, step_count)
+    reason = nonfinite_message(name, value, bad, step_count)
     if on_nonfinite == "stop":
-        raise NotFinite(f"{reason}; {REMEDIES[name]}, or let such flocks begin anew with env.on_nonfinite=restart")
-    warnings.warn(f"{reason}; that flock begins anew", RuntimeWarning, stacklevel=3)
+        raise NotFinite(f"{reason}; {REMEDIES[name]}, or restart such flocks with env.on_nonfinite=restart")
+    warnings.warn(f"{reason}; that flock restarts", RuntimeWarning, stacklevel=3)
     flocks: list[int] = bad.any(-1).nonzero().flatten().tolist()
     return flocks
 
 
-def unusable(value: Tensor, counts: Tensor | None = None) -> Tensor | None:
-    """Find values that are not finite, or so large that squared differences of two of them are not.
+def nonfinite_agents(value: Tensor, counts: Tensor | None = None) -> Tensor | None:
+    """Find values that are NaN or infinite, or so large that squared differences of two of them overflow.
 
     Args:
-        value: of agents [B, N, D].
-        counts: agents that count, bool [B, N]; default: all.
+        value: one vector per agent [B, N, D].
+        counts: agents to check, bool [B, N]; default: all.
 
     Returns:
-        agents with such a value, bool [B, N]; None where nobody has one.
+        agents with such a value, bool [B, N]; None if there are none.
     """
     largest = torch.finfo(value.dtype).max ** 0.5 / 4
     if torch.linalg.vector_norm(value) < largest:
@@ -62,19 +65,19 @@ def unusable(value: Tensor, counts: Tensor | None = None) -> Tensor | None:
     return bad if bad.any() else None
 
 
-def complaint(name: str, value: Tensor, bad: Tensor, step_count: Tensor) -> str:
+def nonfinite_message(name: str, value: Tensor, bad: Tensor, step_count: Tensor) -> str:
     """The first clause of an error message.
 
     Args:
         name: what the values are.
-        value: [B, N, D].
-        bad: agents whose value is `unusable`, bool [B, N].
-        step_count: steps that each flock has flown [B, 1].
+        value: one vector per agent [B, N, D].
+        bad: agents found by `nonfinite_agents`, bool [B, N].
+        step_count: steps since each flock's reset [B, 1].
     """
     flock, agent = bad.nonzero()[0].tolist()
     found = value[flock, agent]
     more = int(bad.any(-1).sum()) - 1
     others = f", as in {more} other flock{'s' if more > 1 else ''}" if more else ""
-    wrong = "too large to compute with" if found.isfinite().all() else "not finite"
+    wrong = "too large to compute with" if found.isfinite().all() else "NaN or infinite"
     step = int(step_count[flock])
     return f"the {name} of agent {agent} in flock {flock} at step {step} is {wrong} ({found.tolist()}){others}"

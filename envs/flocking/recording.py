@@ -13,7 +13,7 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking.metrics import action_error, cohesion, leader_distance, separation
-from modgnn_rl.envs.flocking.neighbours import near_pairs
+from modgnn_rl.utils.neighbours import near_pairs
 
 __all__ = ["METRICS", "QUANTUM", "Recorder", "Recording", "spacing"]
 

@@ -1,7 +1,6 @@
-"""What flocking is for, as a reward: follow the leader, keep together, keep apart, move as one, with little effort.
+"""Reward and termination: follow the leader, stay together, keep apart, move at the same velocity, with little effort.
 
-It knows nothing of the expert. Each purpose is a cost of its own, zero at best; the reward is their weighted sum below
-zero. `judge` adds whether a rollout is over.
+Each goal is a nonnegative cost; the reward is minus their weighted sum. It does not depend on the expert.
 """
 
 from __future__ import annotations
@@ -15,21 +14,21 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking.metrics import is_diverged
 from modgnn_rl.utils.tensors import squared_norm
 
-__all__ = ["COSTS", "LIMITS", "flocking_costs", "flocking_reward", "judge", "reward_weights"]
+__all__ = ["COSTS", "LIMITS", "flocking_costs", "flocking_reward", "reward_weights", "step_outcome"]
 
-LIMITS = ("max_distance", "max_colliding", "collision_distance", "crowding_distance")  # settings that `judge` reads
+LIMITS = ("max_distance", "max_colliding", "collision_distance", "crowding_distance")  # settings for `step_outcome`
 COSTS = {
-    "leader": "distance from the leader, m",
-    "cohesion": "distance from the flock's centre of mass, m",
+    "leader": "distance to the leader, m",
+    "cohesion": "distance to the flock's centre of mass, m",
     "crowding": "(1 - d / crowding_distance)^2 where the nearest agent is at d < crowding_distance, else 0",
     "collision": "1 where the nearest agent is closer than collision_distance, else 0",
-    "alignment": "difference of the velocity from the flock's mean velocity, m/s",
-    "effort": "difference of the target velocity from the velocity, m/s: with k_p, the acceleration asked for",
+    "alignment": "difference between the velocity and the flock's mean velocity, m/s",
+    "effort": "difference between target velocity and velocity, m/s; times k_p, the commanded acceleration",
 }
 
 
 def reward_weights(config: FlockingConfig) -> dict[str, float]:
-    """The weights ``<name>_cost`` of the costs that count in a world; those of zero are left out."""
+    """The nonzero weights ``<name>_cost`` of the costs, by name."""
     weights = {name: float(getattr(config, f"{name}_cost")) for name in COSTS}
     return {name: weight for name, weight in weights.items() if weight}
 
@@ -44,19 +43,19 @@ def flocking_costs(
     collision_distance: float,
     exists: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """All costs of one step, see `COSTS`; the leader is agent 0.
+    """Compute all costs of one step, see `COSTS`; the leader is agent 0.
 
     Args:
         position: m [*B, N, 3].
         velocity: m/s [*B, N, 3].
-        target_velocity: what the agents were told, m/s [*B, N, 3].
-        nearest: distance of the nearest other agent, m [*B, N]; infinite where there is none.
-        crowding_distance: distance below which agents are in each other's way, m.
-        collision_distance: distance below which they touch, m.
-        exists: agents that exist, bool [*B, N]; the others do not count in means. Default: all.
+        target_velocity: of all agents, including the leader, m/s [*B, N, 3].
+        nearest: distance to the nearest other agent, m [*B, N]; infinite if there is none.
+        crowding_distance: distance below which agents crowd each other, m.
+        collision_distance: distance below which agents collide, m.
+        exists: agents that exist, bool [*B, N]; means are over these. Default: all.
 
     Returns:
-        by name [*B, N]; whatever the data for agents that do not exist.
+        costs by name [*B, N]; arbitrary values for agents that do not exist.
     """
     return {
         "leader": _norm(position - position[..., :1, :]),
@@ -69,12 +68,12 @@ def flocking_costs(
 
 
 def flocking_reward(costs: Mapping[str, Tensor], weights: Mapping[str, float], exists: Tensor | None = None) -> Tensor:
-    """Reward of each agent for one step: ``r_i = - sum over the costs c of weight_c cost_c,i``.
+    """Reward of each agent for one step, ``r_i = - sum_c weight_c cost_c,i``.
 
     Args:
         costs: by name [*B, N].
-        weights: by name; costs without one do not count.
-        exists: agents that exist, bool [*B, N]; the others get 0. Default: all.
+        weights: by name; costs without a weight are ignored.
+        exists: agents that exist, bool [*B, N]; the others get reward 0. Default: all.
 
     Returns:
         reward [*B, N, 1].
@@ -85,7 +84,7 @@ def flocking_reward(costs: Mapping[str, Tensor], weights: Mapping[str, float], e
     return (reward if exists is None else torch.where(exists, reward, 0.0)).unsqueeze(-1)
 
 
-def judge(
+def step_outcome(
     position: Tensor,
     velocity: Tensor,
     target_velocity: Tensor,
@@ -95,23 +94,23 @@ def judge(
     limits: Mapping[str, float],
     weights: Mapping[str, float],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What a step has brought.
+    """Evaluate the state after a step, in one function so that it compiles into one.
 
     Args:
         position: m [B, N, 3].
         velocity: m/s [B, N, 3].
-        target_velocity: what the agents were told, m/s [B, N, 3].
-        nearest: distance of the nearest other agent, m [B, N].
-        sizes: agents of each flock [B].
-        exists: agents that exist, bool [B, N]; default: all.
+        target_velocity: of all agents, including the leader, m/s [B, N, 3].
+        nearest: distance to the nearest other agent, m [B, N].
+        sizes: number of agents of each flock [B].
+        exists: agents that exist, bool [B, N]; None: all.
         limits: the settings named in `LIMITS`.
-        weights: of the costs, see `reward_weights`.
+        weights: see `reward_weights`.
 
     Returns:
-        state [B, N, 6], reward [B, N, 1], and whether the rollout is over [B, 1].
+        positions and velocities [B, N, 6], reward [B, N, 1], and whether the episode terminates, bool [B, 1].
     """
-    touching = nearest < limits["collision_distance"]
-    colliding = touching.sum(-1) > limits["max_colliding"] * sizes
+    in_collision = nearest < limits["collision_distance"]
+    colliding = in_collision.sum(-1) > limits["max_colliding"] * sizes
     terminated = (is_diverged(position, limits["max_distance"], exists) | colliding).unsqueeze(-1)
     costs = flocking_costs(
         position,
@@ -126,7 +125,7 @@ def judge(
 
 
 def _norm(vectors: Tensor) -> Tensor:
-    """Euclidean norm of [..., 3], much faster on a CPU than torch.linalg.vector_norm."""
+    """Euclidean norm of vectors [..., 3]; much faster on a CPU than torch.linalg.vector_norm."""
     return squared_norm(vectors.unbind(-1)).sqrt()
 
 

@@ -1,6 +1,6 @@
-"""What rollouts continue from, as named tensors: taken apart, and put back where it fits.
+"""Snapshots: the complete state of running rollouts as named tensors.
 
-Rollouts that are interrupted and restored go on bit for bit when the generators of the environment are set too.
+Rollouts that are restored from a snapshot continue bit for bit if the random generators are restored too.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from torch import Tensor
 
 from modgnn_rl.errors import InputError
 
-__all__ = ["Stateful", "refuse_foreign"]
+__all__ = ["Stateful", "check_snapshot"]
 
 
 class Stateful:
-    """Something whose state is the attributes that its class names in `STATE`: tensors, or None where not needed."""
+    """Base of classes whose state is the attributes named in `STATE`: tensors, or None where a feature is off."""
 
     STATE: ClassVar[tuple[str, ...]] = ()
 
@@ -26,27 +26,27 @@ class Stateful:
         return {name: value.clone() for name, value in state.items() if value is not None}
 
     def restore(self, snapshot: Mapping[str, Tensor]) -> None:
-        """Go on from a copy of what `snapshot` gave, whatever device it is on."""
+        """Continue from a snapshot, whatever device it is on."""
         for name, value in snapshot.items():
             setattr(self, name, value.to(getattr(self, name).device, copy=True))
 
 
-def refuse_foreign(snapshot: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    """Refuse a snapshot that is not of the kind of one's own, or of flocks of other sizes.
+def check_snapshot(snapshot: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
+    """Check that a snapshot has the same tensors, shapes and flock sizes as the environment's own.
 
     Raises:
         InputError: with the first difference.
     """
     for name in sorted(own.keys() | snapshot.keys()):
-        theirs, ours = _described(snapshot.get(name)), _described(own.get(name))
+        theirs, ours = _description(snapshot.get(name)), _description(own.get(name))
         if name == "sizes" and theirs == ours:
             theirs, ours = (str(kept[name].tolist()) for kept in (snapshot, own))
         if theirs != ours:
             raise InputError(
                 f"the snapshot is of other flocks, agents or settings: its {name} is {theirs}, that of this "
-                f"environment is {ours}; build the environment as the one that it was taken of"
+                f"environment is {ours}; create the environment with the arguments of the one that was saved"
             )
 
 
-def _described(value: Tensor | None) -> str:
+def _description(value: Tensor | None) -> str:
     return "absent" if value is None else f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)}"

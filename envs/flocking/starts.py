@@ -1,4 +1,4 @@
-"""Starting positions of flocks."""
+"""Initial positions of flocks."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from modgnn_rl.envs.flocking.neighbours import near_pairs
 from modgnn_rl.errors import InputError
+from modgnn_rl.utils.neighbours import near_pairs
 
 __all__ = ["clusters", "grid", "start_positions", "uniform_ball"]
 
-MAX_DRAWS = 1000
+MAX_SAMPLES = 1000
 BALL_AS_CUBE = (4 / 3 * math.pi) ** (1 / 3)  # side of the cube with the volume of a ball of radius 1
-CLUSTER_SPACING = 2.4  # between the centres of clusters that are neighbours, in their radii
+CLUSTER_SPACING = 2.4  # distance between the centres of adjacent clusters, in cluster radii
 
 
 def start_positions(
@@ -30,24 +30,24 @@ def start_positions(
     dtype: torch.dtype = torch.float32,
     exists: Tensor | None = None,
 ) -> Tensor:
-    """Where the agents of flocks start.
+    """Sample the initial positions of flocks.
 
     Args:
         kind: ``ball``, see `uniform_ball`; ``grid``, see `grid`; ``clusters``, see `clusters`.
         flocks: number of flocks B.
         agents: number of agents N in each.
-        radius: of the ball, m, or of each flock's ball [B]; grid and clusters fill as much space.
-        min_distance: smallest distance between two agents, m.
+        radius: of the ball, m, or of each flock's ball [B]; grid and clusters have the same volume.
+        min_distance: minimum distance between two agents, m.
         num_clusters: number of clusters.
-        generator: source of randomness; its device is where the positions are made.
+        generator: source of randomness; positions are on its device.
         dtype: floating-point type.
-        exists: agents that exist, bool [B, N]; the others may be anywhere. Default: all.
+        exists: agents that exist, bool [B, N]; the positions of the others are arbitrary. Default: all.
 
     Returns:
         positions, m [B, N, 3].
 
     Raises:
-        InputError: when the agents do not fit.
+        InputError: the agents do not fit.
     """
     if kind == "grid":
         return grid(flocks, agents, radius, min_distance, generator=generator, dtype=dtype, exists=exists)
@@ -68,7 +68,7 @@ def uniform_ball(
     dtype: torch.dtype = torch.float32,
     exists: Tensor | None = None,
 ) -> Tensor:
-    """Agents uniform in a ball about the origin, drawn again where two are too close; see `start_positions`."""
+    """Agents uniform in a ball around the origin, resampled where two are too close; see `start_positions`."""
     size = _by_flock(radius, generator, dtype)
     return _apart(lambda: _in_ball(flocks, agents, size, generator, dtype), min_distance, radius, exists)
 
@@ -83,7 +83,7 @@ def grid(
     dtype: torch.dtype = torch.float32,
     exists: Tensor | None = None,
 ) -> Tensor:
-    """Agents at random sites of a cubic grid about the origin, each a little off its site; see `start_positions`."""
+    """Agents at random sites of a cubic grid around the origin, with small random offsets; see `start_positions`."""
     device = generator.device
     exists = torch.ones(flocks, agents, dtype=torch.bool, device=device) if exists is None else exists
     side = _side(exists.sum(-1, keepdim=True))
@@ -91,13 +91,13 @@ def grid(
     if (spacing < min_distance).any():
         raise _too_crowded(agents, min_distance, radius)
     site = torch.arange(int(_side(torch.tensor(agents))) ** 3, device=device)
-    lot = torch.rand(flocks, len(site), generator=generator, device=device)
-    order = lot.masked_fill(site >= side**3, torch.inf).argsort(-1)
+    priority = torch.rand(flocks, len(site), generator=generator, device=device)
+    order = priority.masked_fill(site >= side**3, torch.inf).argsort(-1)
     site = order.gather(-1, (exists.cumsum(-1) - 1).clamp(min=0))
-    # Half of what is free would let two agents come as close as they may; a quarter keeps the grid recognisable.
-    play = (spacing - min_distance) / 4
-    off = 2 * torch.rand(flocks, agents, 3, generator=generator, device=device, dtype=dtype) - 1
-    return (_place(site, side).to(dtype) - (side.unsqueeze(-1) - 1) / 2) * spacing + play * off
+    # Offsets of half the free space would allow the minimum distance; a quarter keeps the grid recognisable.
+    max_offset = (spacing - min_distance) / 4
+    offset = 2 * torch.rand(flocks, agents, 3, generator=generator, device=device, dtype=dtype) - 1
+    return (_place(site, side).to(dtype) - (side.unsqueeze(-1) - 1) / 2) * spacing + max_offset * offset
 
 
 def clusters(
@@ -111,10 +111,10 @@ def clusters(
     dtype: torch.dtype = torch.float32,
     exists: Tensor | None = None,
 ) -> Tensor:
-    """Agents in several balls that have the volume of one of ``radius`` together; see `start_positions`.
+    """Agents in several balls whose total volume is that of one ball of ``radius``; see `start_positions`.
 
-    The balls sit close together, without touching, on a cubic grid that is turned at random. Agents are dealt out to
-    them in turns, the leader to a random one.
+    The balls lie close together, without overlap, on a cubic grid in a random orientation. Agents are assigned to them
+    in turn, the leader to a random one.
     """
     device = generator.device
     size = _by_flock(radius, generator, dtype) * num_clusters ** (-1 / 3)
@@ -135,37 +135,37 @@ def _by_flock(radius: float | Tensor, generator: torch.Generator, dtype: torch.d
 
 
 def _side(count: Tensor) -> Tensor:
-    """Sites along the side of the smallest cubic grid that has so many, at least 1."""
+    """Sites along the side of the smallest cubic grid with at least ``count`` sites."""
     return (count.double() ** (1 / 3)).sub(1e-6).ceil().clamp(min=1).long()
 
 
 def _place(site: Tensor, side: Tensor) -> Tensor:
-    """Coordinates [..., 3] of sites of a cubic grid [...]; successive sites are neighbours along a row."""
+    """Coordinates [..., 3] of sites of a cubic grid [...]; consecutive sites are adjacent along a row."""
     return torch.stack((site // side**2, site // side % side, site % side), -1)
 
 
 def _in_ball(flocks: int, agents: int, radius: Tensor, generator: torch.Generator, dtype: torch.dtype) -> Tensor:
-    """Points uniform in a ball about the origin [B, N, 3]."""
+    """Points uniform in a ball around the origin [B, N, 3]."""
     device = generator.device
     direction = torch.randn(flocks, agents, 3, generator=generator, device=device, dtype=dtype)
-    share = torch.rand(flocks, agents, 1, generator=generator, device=device, dtype=dtype)
-    return radius * share.pow(1 / 3) * direction / direction.norm(dim=-1, keepdim=True)
+    fraction = torch.rand(flocks, agents, 1, generator=generator, device=device, dtype=dtype)
+    return radius * fraction.pow(1 / 3) * direction / direction.norm(dim=-1, keepdim=True)
 
 
-def _apart(draw: Callable[[], Tensor], min_distance: float, radius: float | Tensor, exists: Tensor | None) -> Tensor:
-    """Draw positions [B, N, 3], and of each pair that is too close the later agent again."""
-    position = draw()
+def _apart(sample: Callable[[], Tensor], min_distance: float, radius: float | Tensor, exists: Tensor | None) -> Tensor:
+    """Sample positions [B, N, 3]; of each pair that is too close, resample the agent with the larger index."""
+    position = sample()
     if not min_distance:
         return position
-    for _ in range(MAX_DRAWS):
-        there = position if exists is None else position.masked_fill(~exists.unsqueeze(-1), torch.nan)
-        flock, later, earlier, distance = near_pairs(there, min_distance)
+    for _ in range(MAX_SAMPLES):
+        candidates = position if exists is None else position.masked_fill(~exists.unsqueeze(-1), torch.nan)
+        flock, later, earlier, distance = near_pairs(candidates, min_distance)
         close = (distance < min_distance) & (earlier < later)
         if not close.any():
             return position
-        redraw = torch.zeros(position.shape[:2], dtype=torch.bool, device=position.device)
-        redraw[flock[close], later[close]] = True
-        position = torch.where(redraw.unsqueeze(-1), draw(), position)
+        resample = torch.zeros(position.shape[:2], dtype=torch.bool, device=position.device)
+        resample[flock[close], later[close]] = True
+        position = torch.where(resample.unsqueeze(-1), sample(), position)
     raise _too_crowded(position.shape[1], min_distance, radius)
 
 

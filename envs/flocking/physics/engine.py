@@ -21,7 +21,7 @@ from modgnn_rl.envs.flocking.physics.vectors import Components, Vector, add, rot
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.compile import compiled
 
-__all__ = ["SimulationState", "Physics", "TorchPhysics", "advance", "make_physics"]
+__all__ = ["Physics", "SimulationState", "TorchPhysics", "advance", "make_physics"]
 
 Move = Callable[[Bodies, Tensor, Vector, Dynamics, int, Components | None], Bodies]
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.nonfinite import unusable
+from modgnn_rl.envs.flocking.nonfinite import nonfinite_agents
 from modgnn_rl.errors import InputError, NotFinite
 from modgnn_rl.utils.tensors import pair_distances
 
@@ -82,7 +82,7 @@ def is_finite(td: TensorDictBase) -> bool:
 @pytest.mark.parametrize("name", SABOTEURS)
 def test_flights_stop_with_one_sentence(name: str) -> None:
     kind = name.split()[0]
-    wrong = "too large to compute with" if "huge" in name else "not finite"
+    wrong = "too large to compute with" if "huge" in name else "NaN or infinite"
     message = rf"the {kind} of agent 2 in flock 1 at step 3 is {wrong} \(\[.*env\.on_nonfinite=restart"
     with pytest.raises(NotFinite, match=message):
         rollout(FlockingEnv(3, 4, seed=0), 5, SABOTEURS[name])
@@ -105,7 +105,7 @@ def test_only_the_lost_flock_begins_anew(settings: dict[str, Any], name: str) ->
     settings = {"num_agents": 4, "leader_noise": 0.0, "on_nonfinite": "restart", **settings}
     env, twin = (FlockingEnv(3, seed=0, **settings) for _ in range(2))
     others = [flock for flock in range(3) if flock != FLOCK]
-    with pytest.warns(RuntimeWarning, match=r"of agent 2 in flock 1 at step 3 is .*that flock begins anew") as record:
+    with pytest.warns(RuntimeWarning, match=r"of agent 2 in flock 1 at step 3 is .*that flock restarts") as record:
         found = rollout(env, 8, SABOTEURS[name])
     expected = rollout(twin, 8)
     assert len(record) == 1
@@ -162,7 +162,7 @@ def test_agents_that_are_not_flown_lose_nothing() -> None:
 def test_what_is_usable_has_finite_distances(value: float, dtype: torch.dtype, component: int) -> None:
     state = torch.zeros(2, 3, 6, dtype=dtype)
     state[1, 2, component], state[1, 1, component] = value, -value
-    bad = unusable(state)
+    bad = nonfinite_agents(state)
     if bad is None:
         assert pair_distances(state[1]).square().isfinite()[~torch.eye(3, dtype=torch.bool)].all()
     else:

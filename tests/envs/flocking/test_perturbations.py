@@ -120,7 +120,7 @@ def test_delay_begins_anew_with_each_flight() -> None:
 def test_ranges_belong_to_senders_and_stay_for_a_flight() -> None:
     env = FlockingEnv(20, 12, seed=0, range_spread=0.5, max_steps=10)
     rollouts = env.rollout(10)
-    reach = env.perturbations.reach
+    reach = env.perturbations.send_range
     assert reach is not None
     assert 0.5 * 3.5 <= float(reach.min()) < 2.0 < 5.0 < float(reach.max()) <= 1.5 * 3.5
     position = rollouts["agents", "observation"][..., :3]
@@ -129,8 +129,8 @@ def test_ranges_belong_to_senders_and_stay_for_a_flight() -> None:
     assert torch.equal(rollouts["adjacency"], expected)
     assert not torch.equal(rollouts["adjacency"], rollouts["adjacency"].mT)
     env.reset()
-    assert env.perturbations.reach is not None
-    assert not torch.equal(env.perturbations.reach, reach)
+    assert env.perturbations.send_range is not None
+    assert not torch.equal(env.perturbations.send_range, reach)
 
 
 # Sensors
@@ -161,10 +161,10 @@ def test_one_that_dropped_out_hovers_and_neither_hears_nor_is_heard() -> None:
     env.reset()
     out = torch.zeros(4, 6, dtype=torch.bool)
     out[:, 2] = True
-    env.perturbations.running = ~out
+    env.perturbations.active = ~out
     td = env.reset().update(env.full_action_spec.zero())
     assert bool(td["agents", "mask"].all())  # a reset brings all back
-    env.perturbations.running = ~out
+    env.perturbations.active = ~out
     td["agents", "action"] = torch.full((4, 6, 3), 0.5)
     td["agents", "action"][:, 2] = math.nan  # nobody asks it
     after = env.step(td)["next"]
@@ -182,7 +182,7 @@ def test_drop_outs_come_and_go_at_their_rates() -> None:
     there = []
     for _ in range(480):
         env.perturbations.step()
-        there.append(env.perturbations.running.clone())
+        there.append(env.perturbations.active.clone())
     running = torch.stack(there)[:, :, 1:].double()
     assert bool(torch.stack(there)[:, :, 0].all())  # never the leader
     # Two states with rates 0.5 and 1 / 2.0 a second: half of the time each, in the long run.

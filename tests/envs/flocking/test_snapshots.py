@@ -130,16 +130,19 @@ def test_names() -> None:
         "target_velocity",
         *(f"physics.{name}" for name in bodies),
         "leader.velocity",
-        *(f"perturbations.{name}" for name in ("running", "reach", "gust", "late")),
+        *(f"perturbations.{name}" for name in ("active", "send_range", "gust", "delayed")),
     }
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_envs": 2}, r"its perturbations\.gust is float32 \[2, 1, 3\], that of this environment is float32 \[3, 1, 3\]"),
-        ({"num_agents": 4}, r"perturbations\.late is float32 \[0, 3, 4, 6\]"),
-        ({"delay": 2}, r"perturbations\.late is float32 \[2, 3, 5, 6\]"),
+        (
+            {"num_envs": 2},
+            r"its perturbations\.gust is float32 \[2, 1, 3\], that of this environment is float32 \[3, 1, 3\]",
+        ),
+        ({"num_agents": 4}, r"perturbations\.delayed is float32 \[0, 3, 4, 6\]"),
+        ({"delay": 2}, r"perturbations\.delayed is float32 \[2, 3, 5, 6\]"),
         ({"num_agents": [2, 5]}, r"its sizes is \[2, 5, 2\], that of this environment is \[5, 5, 5\]"),
         ({"leader": "circle"}, r"its leader\.heading is float32 \[3, 1\], that of this environment is absent"),
         ({"motor_lag": 0.05}, r"physics\.rotors is float32 \[3, 5, 4\], that of this environment is absent"),
@@ -151,7 +154,7 @@ def test_snapshots_of_another_world_are_refused(settings: dict[str, Any], messag
     env = make()
     env.reset()
     before = env.snapshot()
-    with pytest.raises(InputError, match=f"of other flocks, agents or settings: .*{message}.*build the environment as"):
+    with pytest.raises(InputError, match=f"of other flocks, agents or settings: .*{message}.*create the environment with"):
         env.restore(make(seed=1, **settings).snapshot())
     after = env.snapshot()
     assert all(torch.equal(value, after[name]) for name, value in before.items())

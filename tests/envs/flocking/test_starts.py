@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from modgnn_rl.envs.flocking.neighbours import near_pairs
 from modgnn_rl.envs.flocking.starts import clusters, grid, start_positions, uniform_ball
 from modgnn_rl.errors import InputError
+from modgnn_rl.utils.neighbours import near_pairs
 
 KINDS = ("ball", "grid", "clusters")
 

@@ -266,9 +266,7 @@ def test_reset_puts_flocks_level_and_leaves_the_others() -> None:
     assert not engine.spin[[0, 2]].any()
     assert not stack(engine.state.integral)[:, [0, 2]].any()
     assert stack(before.integral).all()
-    for old, new in zip(
-        (*before.bodies, before.integral), (*engine.state.bodies, engine.state.integral), strict=True
-    ):
+    for old, new in zip((*before.bodies, before.integral), (*engine.state.bodies, engine.state.integral), strict=True):
         assert torch.equal(stack(old)[:, [1, 3]], stack(new)[:, [1, 3]])
 
 

@@ -1,4 +1,4 @@
-"""Near pairs against a comparison of all pairs, whichever way they are found; lists of links."""
+"""Near pairs against a comparison of all pairs, by both algorithms."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from modgnn_rl.envs.flocking import neighbours
-from modgnn_rl.envs.flocking.neighbours import link_list, near_pairs
-from modgnn_rl.errors import InputError
+from modgnn_rl.utils import neighbours
+from modgnn_rl.utils.neighbours import near_pairs
 from modgnn_rl.utils.tensors import PAIRS_IN_BLOCK, pair_distances
 
 WAYS = ("blocks", "cells")
@@ -22,7 +21,7 @@ radii = st.sampled_from([0.05, 0.5, 1.0, 3.5, 100.0])
 
 @pytest.fixture(params=WAYS)
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Whatever the size of the flocks, find pairs in this way, a few at a time."""
+    """Find pairs by this algorithm, whatever the size of the flocks, a few at a time."""
     use(monkeypatch, request.param)
     return str(request.param)
 
@@ -66,18 +65,18 @@ def test_near_pairs_are_those_of_all_pairs_bit_for_bit(
 
 
 @given(st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=20), st.sampled_from([0.1, 0.5, 1.0, 2.0]))
-def test_agents_on_the_borders_of_cells(places: list[tuple[int, int, int]], radius: float) -> None:
+def test_agents_on_the_boundaries_of_cells(places: list[tuple[int, int, int]], radius: float) -> None:
     """On a lattice whose spacing is the radius, many distances are exactly the radius."""
     both_ways(radius * torch.tensor([places], dtype=torch.float32), radius)
     both_ways(torch.tensor([places], dtype=torch.float64) * (radius * neighbours.SLACK), radius)
 
 
 @given(st.lists(st.tuples(*[st.floats(width=32)] * 3), min_size=1, max_size=8), radii)
-def test_any_numbers_at_all(places: list[tuple[float, float, float]], radius: float) -> None:
+def test_arbitrary_positions(places: list[tuple[float, float, float]], radius: float) -> None:
     both_ways(torch.tensor([places, places[::-1]], dtype=torch.float32), radius)
 
 
-def test_agents_that_are_nowhere_are_near_nobody(way: str) -> None:
+def test_agents_with_nan_positions_are_in_no_pair(way: str) -> None:
     position = torch.zeros(2, 6, 3)
     position[0, 1, 2], position[0, 3], position[1, 4, 0] = math.nan, math.inf, -math.inf
     flock, receiver, sender, distance = near_pairs(position, 1.0)
@@ -90,8 +89,8 @@ def test_agents_that_are_nowhere_are_near_nobody(way: str) -> None:
         assert [len(part) for part in near_pairs(nothing, 1.0)] == [0] * 4
 
 
-def test_flocks_do_not_meet(way: str) -> None:
-    """Flocks in the same place, or as far apart as numbers allow, have their own links only."""
+def test_pairs_do_not_cross_flocks(way: str) -> None:
+    """Flocks in the same place, or as far apart as floating point allows, have only their own pairs."""
     alone = scattered(3, 1, 20)
     expected = near_pairs(alone, 2.0)
     far = torch.tensor([0.0, 1e5, -1e7, 1e15]).view(-1, 1, 1)
@@ -103,7 +102,7 @@ def test_flocks_do_not_meet(way: str) -> None:
 
 
 @given(seeds)
-def test_renumbering_agents_renumbers_links(seed: int) -> None:
+def test_permuting_agents_permutes_pairs(seed: int) -> None:
     position, generator = scattered(seed, 2, 30), torch.Generator().manual_seed(seed)
     order = torch.randperm(30, generator=generator)
     flock, receiver, sender, _ = near_pairs(position[:, order], 1.0)
@@ -113,14 +112,14 @@ def test_renumbering_agents_renumbers_links(seed: int) -> None:
 
 @pytest.mark.parametrize("radius", [0.4, 2.0, 50.0])
 def test_large_flocks(radius: float) -> None:
-    """As they come: some sorted into cells, some not."""
+    """By the default choice of algorithm."""
     generator = torch.Generator().manual_seed(0)
     position = 10 * torch.randn(2, 600, 3, generator=generator)
     assert_all_and_only_the_near_pairs(position, radius)
 
 
-def test_a_wide_flock_of_thousands_is_compared_with_its_surroundings_only() -> None:
-    """Of the 17 million pairs of 4,096 agents, few are looked at."""
+def test_agents_of_a_wide_flock_are_compared_only_with_those_in_adjacent_cells() -> None:
+    """Of the 17 million pairs of 4,096 agents, few are compared."""
     generator = torch.Generator().manual_seed(0)
     position = 40 * torch.rand(1, 4096, 3, generator=generator)
     cells = neighbours._Cells(position, 2.0)
@@ -128,28 +127,3 @@ def test_a_wide_flock_of_thousands_is_compared_with_its_surroundings_only() -> N
     place, distance = cells.near_pairs()
     assert torch.equal(place, (pair_distances(position) <= 2.0).flatten().nonzero().view(-1))
     assert (distance <= 2.0).all()
-
-
-# Lists of links.
-
-
-@given(seeds, st.integers(1, 4), st.integers(1, 8))
-def test_lists_hold_each_flocks_links_and_nothing_else(seed: int, flocks: int, agents: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    adjacency = torch.rand(flocks, agents, agents, generator=generator) < 0.4
-    flock, receiver, sender = adjacency.nonzero().unbind(-1)
-    links = link_list(flock, receiver, sender, flocks, agents**2 + 2)
-    assert links.shape == (flocks, 2, agents**2 + 2)
-    assert links.dtype == torch.int64
-    for number in range(flocks):
-        count = int(adjacency[number].sum())
-        assert torch.equal(links[number, :, :count].flip(0).t(), adjacency[number].nonzero())
-        assert (links[number, :, count:] == -1).all()
-
-
-def test_a_list_that_is_too_short_is_refused() -> None:
-    flock = torch.tensor([0, 1, 1, 1])
-    ends = torch.tensor([0, 0, 1, 2])
-    assert (link_list(flock, ends, ends.flip(0), 2, 3) >= 0).sum() == 8
-    with pytest.raises(InputError, match=r"flock 1 has 3 links, .* room for 2: raise env.max_links"):
-        link_list(flock, ends, ends.flip(0), 2, 2)
