@@ -139,9 +139,9 @@ def test_names() -> None:
     [
         (
             {"num_envs": 2},
-            r"its perturbations\.gust is float32 \[2, 1, 3\], that of this environment is float32 \[3, 1, 3\]",
+            r"its perturbations\.active is bool \[2, 5\], that of this environment is bool \[3, 5\]",
         ),
-        ({"num_agents": 4}, r"perturbations\.delayed is float32 \[0, 3, 4, 6\]"),
+        ({"num_agents": 4}, r"perturbations\.active is bool \[3, 4\]"),
         ({"delay": 2}, r"perturbations\.delayed is float32 \[2, 3, 5, 6\]"),
         ({"num_agents": [2, 5]}, r"its sizes is \[2, 5, 2\], that of this environment is \[5, 5, 5\]"),
         ({"leader": "circle"}, r"its leader\.heading is float32 \[3, 1\], that of this environment is absent"),
@@ -154,7 +154,8 @@ def test_snapshots_of_another_world_are_refused(settings: dict[str, Any], messag
     env = make()
     env.reset()
     before = env.snapshot()
-    with pytest.raises(InputError, match=f"of other flocks, agents or settings: .*{message}.*create the environment with"):
+    expected = f"of other flocks, agents or settings: .*{message}.*create the environment with"
+    with pytest.raises(InputError, match=expected):
         env.restore(make(seed=1, **settings).snapshot())
     after = env.snapshot()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
