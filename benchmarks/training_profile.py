@@ -15,7 +15,6 @@ import numpy as np
 
 from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import TrainConfig
-from modgnn_rl.registry import TRAINERS
 
 WHOLE = ("forward", "logging", "logging: reference rollouts, once")
 
@@ -107,9 +106,4 @@ def main(config: TrainConfig) -> None:
 
 
 if __name__ == "__main__":
-    run_command(
-        main,
-        TrainConfig,
-        "train",
-        nodes={f"trainer/{name}": entry.option("settings") for name, entry in TRAINERS.items()},
-    )
+    run_command(main, TrainConfig, "train")

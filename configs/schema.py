@@ -12,9 +12,9 @@ from typing import Any
 from omegaconf import MISSING
 
 from modgnn_rl.configs.flocking import REFERENCE_SIZE, EnvOverrides, FlockingConfig
-from modgnn_rl.configs.settings import as_list, setting
+from modgnn_rl.configs.settings import as_list, group, setting
 from modgnn_rl.configs.trainers import BCConfig, DAggerConfig, ImitationConfig, MAPPOConfig, TrainerConfig
-from modgnn_rl.registry import MODELS
+from modgnn_rl.registry import MODELS, TRAINERS
 
 __all__ = [
     "REFERENCE_SIZE",
@@ -107,8 +107,8 @@ class TrainConfig:
     """A training run."""
 
     env: FlockingConfig = field(default_factory=FlockingConfig)
-    model: ModelConfig = field(default_factory=ModelConfig)
-    trainer: Any = MISSING
+    model: ModelConfig = group(MODELS, ModelConfig)
+    trainer: Any = group(TRAINERS, TrainerConfig, required=True)
     collector: CollectorConfig = field(default_factory=CollectorConfig)
     seed: int = setting(0, "random seed", ge=0, le=2**32)
     name: str | None = setting(None, "name of the run; null: trainer and model")

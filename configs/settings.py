@@ -18,9 +18,11 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from omegaconf import MISSING
+
 from modgnn_rl.errors import InputError, suggestion
 
-__all__ = ["as_list", "check", "flat", "setting"]
+__all__ = ["as_list", "check", "flat", "group", "setting"]
 
 
 def setting(
@@ -53,6 +55,23 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def group(registry: Mapping[str, Any], base: type, *, required: bool = False) -> Any:
+    """Declare a dataclass field whose choices are the entries of a registry, each with its own settings.
+
+    ``<field>=<name>`` on the command line chooses an entry. Its settings are an instance, with that ``name``, of the
+    dataclass that it was registered with (``settings=``), by default of ``base``.
+
+    Args:
+        registry: a `modgnn_rl.registry.Registry`.
+        base: dataclass with a field ``name``, from which the settings of all entries are derived.
+        required: whether the field has no default, for dataclasses built in Python.
+    """
+    metadata = {"registry": registry, "base": base}
+    if required:
+        return dataclasses.field(default=MISSING, metadata=metadata)
+    return dataclasses.field(default_factory=base, metadata=metadata)
+
+
 def check(config: Any, path: str = "") -> None:
     """Hold every setting of a dataclass against its declared range.
 
@@ -66,12 +85,23 @@ def check(config: Any, path: str = "") -> None:
     for field in dataclasses.fields(config):
         name = f"{path}.{field.name}" if path else field.name
         value = getattr(config, field.name)
-        if dataclasses.is_dataclass(value):
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
             check(value, name)
+            if "registry" in field.metadata:
+                _check_group(name, value, field.metadata["registry"])
         elif "help" in field.metadata:
             if value is None and field.default is None:
                 continue
             _check_list(name, value, field.metadata)
+
+
+def _check_group(name: str, value: Any, registry: Any) -> None:
+    """Raise InputError unless the settings of a field declared with `group` are those of the entry that they name."""
+    if not isinstance(value, registry[value.name].option("settings", object)):
+        raise InputError(
+            f"{name}.name={value.name} does not fit settings of type {type(value).__name__}: choose it by "
+            f"{name}={value.name}"
+        )
 
 
 def _check_list(name: str, value: Any, rule: Any) -> None:

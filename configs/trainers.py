@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import MISSING
 
 from modgnn_rl.configs.settings import setting
-from modgnn_rl.registry import MODELS
+from modgnn_rl.registry import MODELS, TRAINERS
 
 __all__ = ["BCConfig", "DAggerConfig", "ImitationConfig", "MAPPOConfig", "TrainerConfig"]
 
@@ -17,7 +17,7 @@ __all__ = ["BCConfig", "DAggerConfig", "ImitationConfig", "MAPPOConfig", "Traine
 class TrainerConfig:
     """Settings that all trainers share."""
 
-    name: str = setting(MISSING, "trainer", choices=("bc", "dagger", "mappo"))
+    name: str = setting(MISSING, "trainer", choices=TRAINERS)
     num_envs: int = setting(
         32,
         "flocks of 32 agents rolled out in parallel; the same number of agents is split evenly among flock sizes",
@@ -78,7 +78,7 @@ class ImitationConfig(TrainerConfig):
 class BCConfig(ImitationConfig):
     """Behaviour cloning: fit the expert's actions on the expert's own rollouts."""
 
-    name: str = setting("bc", "trainer", choices=("bc",))
+    name: str = setting("bc", "trainer", choices=TRAINERS)
     cloning_steps: int = setting(1000, "steps of each expert rollout", ge=1)
     cloning_updates: int = setting(6000, "updates on the expert's rollouts, in total over flock sizes", ge=1)
     models: Any = setting(
@@ -101,7 +101,7 @@ class BCConfig(ImitationConfig):
 class DAggerConfig(ImitationConfig):
     """DAgger: clone the expert briefly, then each round collect rollouts, label them with the expert, and fit."""
 
-    name: str = setting("dagger", "trainer", choices=("dagger",))
+    name: str = setting("dagger", "trainer", choices=TRAINERS)
     cloning_steps: int = setting(200, "steps of the expert rollouts before the first round", ge=1)
     cloning_updates: int = setting(400, "updates on these rollouts, in total over flock sizes", ge=0)
     rounds: int = setting(80, "number of rounds", ge=0)
@@ -137,7 +137,7 @@ class DAggerConfig(ImitationConfig):
 class MAPPOConfig(TrainerConfig):
     """MAPPO: reinforcement learning from the environment's reward, best from a pretrained policy (``init_from``)."""
 
-    name: str = setting("mappo", "trainer", choices=("mappo",))
+    name: str = setting("mappo", "trainer", choices=TRAINERS)
     ema_decay: float = setting(
         0.99, "decay of the exponential moving average (EMA) of the weights, which is the policy evaluated", ge=0, le=1
     )

@@ -24,8 +24,8 @@ import yaml
 from omegaconf import MISSING
 
 import modgnn_rl
+from modgnn_rl.cli.composition import choice_settings
 from modgnn_rl.cli.help import FLAGS, legal_values
-from modgnn_rl.registry import MODELS
 
 PACKAGE = Path(modgnn_rl.__file__).parent
 CONFIGS = PACKAGE / "configs"
@@ -34,12 +34,11 @@ WORDS = {bool: "true or false", int: "whole number", float: "number", str: "text
 
 
 class Command(NamedTuple):
-    """A command as it declares itself: what runs, the dataclass of its settings, those of single choices."""
+    """A command as it declares itself: what runs, and the dataclass of its settings."""
 
     name: str
     main: Callable[..., Any]
     schema: type
-    nodes: Mapping[str, type]
 
 
 @dataclasses.dataclass
@@ -64,8 +63,8 @@ def commands() -> list[Command]:
     """Every command, in alphabetical order."""
     found = []
 
-    def declare(main: Callable[..., Any], schema: type, name: str, *, nodes: Mapping[str, type] | None = None) -> None:
-        found.append(Command(name, main, schema, nodes or {}))
+    def declare(main: Callable[..., Any], schema: type, name: str) -> None:
+        found.append(Command(name, main, schema))
 
     for file in sorted(CONFIGS.glob("*.yaml")):
         with mock.patch("modgnn_rl.cli.command.run_command", declare), mock.patch.object(sys, "argv", [file.stem]):
@@ -109,10 +108,11 @@ def groups_of(command: Command) -> dict[str, str]:
     }
 
 
-def choices_of(group: str) -> list[str]:
-    """The choices of a group, in alphabetical order; a registered model needs no YAML file."""
+def choices_of(command: Command, group: str) -> list[str]:
+    """The choices of a group in alphabetical order: what is registered, and what has a YAML file."""
+    field = {field.name: field for field in dataclasses.fields(command.schema)}[group]
     files = [file.stem for file in (CONFIGS / group).glob("*.yaml")]
-    return sorted({*files, *(MODELS if group == "model" else ())})
+    return sorted({*files, *field.metadata.get("registry", ())})
 
 
 def _defaults(name: str) -> list[Any]:
@@ -125,16 +125,14 @@ def _yaml(name: str) -> dict[str, Any]:
 
 
 def preset_of(command: Command, group: str, choice: str) -> tuple[type | None, dict[str, Any]]:
-    """The dataclass of a choice, if it has one of its own, and what it sets that is not the default."""
-    typed = {f"/{key.replace('/', '_')}_schema@_here_": node for key, node in command.nodes.items()}
+    """The dataclass of a choice, if it has one of its own, and the values that it sets other than the defaults."""
+    field = {field.name: field for field in dataclasses.fields(command.schema)}[group]
+    if choice in field.metadata.get("registry", ()):
+        return type(choice_settings(field, choice)), {"name": choice}
     kind: type | None = None
     values: dict[str, Any] = {}
-    if not (CONFIGS / group / f"{choice}.yaml").exists() and choice in choices_of(group):
-        return None, {"name": choice}
     for entry in _defaults(f"{group}/{choice}"):
-        if entry in typed:
-            kind = typed[entry]
-        elif entry != "_self_":  # another choice that this one begins with
+        if entry != "_self_":  # another choice that this one begins with
             kind, values = preset_of(command, group, entry)
     return kind, values | {key: value for key, value in _yaml(f"{group}/{choice}").items() if key != "defaults"}
 
@@ -154,7 +152,7 @@ def _sections(known: Iterable[Command]) -> list[Section]:
         hints = typing.get_type_hints(command.schema)
         for field in dataclasses.fields(command.schema):
             kind: Any = hints[field.name] if dataclasses.is_dataclass(hints[field.name]) else field.default_factory
-            for choice in choices_of(field.name) if field.name in groups else []:
+            for choice in choices_of(command, field.name) if field.name in groups else []:
                 own, values = preset_of(command, field.name, choice)
                 values.pop("name", None)  # of the choice itself
                 section_of(command, field.name, own or kind).presets[f"{field.name}={choice}"] = values
@@ -181,7 +179,8 @@ def _commands_page(known: list[Command], sections: list[Section]) -> str:
         if groups:
             lines += ["| group | choices, the default in bold |", "|---|---|"]
         for group, chosen in groups.items():
-            shown = ", ".join(f"**`{choice}`**" if choice == chosen else f"`{choice}`" for choice in choices_of(group))
+            choices = choices_of(command, group)
+            shown = ", ".join(f"**`{choice}`**" if choice == chosen else f"`{choice}`" for choice in choices)
             lines.append(f"| `{group}=` | {shown} |")
         here = [section for section in sections if command.name in section.commands]
         own = next(section for section in here if section.kind is command.schema)

@@ -6,7 +6,8 @@ import argparse
 import sys
 
 import modgnn_rl
-from modgnn_rl.cli.overview import commands, completion, overview
+from modgnn_rl.cli.overview import commands, overview
+from modgnn_rl.cli.tab import completion_script
 from modgnn_rl.errors import InputError, suggestion
 
 
@@ -23,7 +24,7 @@ def main(arguments: list[str]) -> int:
         if flags.version:
             print("modgnn_rl", modgnn_rl.__version__)
         else:
-            print(completion(flags.completion) if flags.completion else overview())
+            print(completion_script(flags.completion) if flags.completion else overview())
     except (argparse.ArgumentError, InputError) as error:
         print("error:", error, file=sys.stderr)
         return 2

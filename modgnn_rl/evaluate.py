@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 
 from modgnn_rl.cli.command import run_command
-from modgnn_rl.configs.schema import EnvOverrides, EvaluateConfig
+from modgnn_rl.configs.schema import EvaluateConfig
 from modgnn_rl.tracking.run_folder import RunFolder
 
 
@@ -28,4 +28,4 @@ def main(config: EvaluateConfig) -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, EvaluateConfig, "evaluate", nodes={"env/changes": EnvOverrides})
+    run_command(main, EvaluateConfig, "evaluate")

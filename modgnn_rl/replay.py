@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from modgnn_rl.cli.command import run_command
-from modgnn_rl.configs.schema import EnvOverrides, ReplayConfig, as_list
+from modgnn_rl.configs.schema import ReplayConfig, as_list
 from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.run_folder import RunFolder
 
@@ -65,4 +65,4 @@ def refuse(config: ReplayConfig) -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, ReplayConfig, "replay", nodes={"env/changes": EnvOverrides})
+    run_command(main, ReplayConfig, "replay")

@@ -8,7 +8,6 @@ import sys
 from modgnn_rl.cli.command import run_command, settings_given
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.experiment.resume import with_stored_trainer
-from modgnn_rl.registry import TRAINERS
 from modgnn_rl.tracking.run_folder import RunFolder
 
 
@@ -43,9 +42,4 @@ def main(config: TrainConfig) -> None:
 
 if __name__ == "__main__":
     sys.argv = with_stored_trainer(sys.argv)
-    run_command(
-        main,
-        TrainConfig,
-        "train",
-        nodes={f"trainer/{name}": entry.option("settings") for name, entry in TRAINERS.items()},
-    )
+    run_command(main, TrainConfig, "train")

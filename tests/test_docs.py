@@ -152,7 +152,7 @@ def compose(line: str, generate: ModuleType) -> None:
     settings = OmegaConf.structured(command.schema)
     for group, default in generate.groups_of(command).items():
         for choice in values_of(overrides.pop(group)) if group in overrides else [default]:
-            if choice in generate.choices_of(group) or not flags.config_dir:  # else a choice of the user's own
+            if choice in generate.choices_of(command, group) or not flags.config_dir:  # else a choice of the user's own
                 kind, values = generate.preset_of(command, group, choice)
                 settings[group] = OmegaConf.structured(kind) if kind else settings[group]
                 settings[group].update(values)

@@ -1,4 +1,4 @@
-"""What ``python -m modgnn_rl`` says: which commands there are, what to try first, and how Tab completes them."""
+"""What ``python -m modgnn_rl`` prints: the commands, what to try first, and how to switch on Tab completion."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import textwrap
 from pathlib import Path
 
 import modgnn_rl
-from modgnn_rl.errors import InputError, suggestion
 
-__all__ = ["commands", "completion", "overview"]
+__all__ = ["commands", "overview"]
 
 ROOT = Path(modgnn_rl.__file__).parent
 FIRST = {
@@ -23,8 +22,8 @@ FIRST = {
 def commands() -> dict[str, str]:
     """The first sentence of each command's docstring, by its name.
 
-    Read from the files, where whatever calls `modgnn_rl.cli.command.run_command` is a command: importing them takes
-    long.
+    A command is a module in ``modgnn_rl/`` that calls `modgnn_rl.cli.command.run_command`. The files are read, not
+    imported, since that takes long.
     """
     found = {}
     for path in sorted(ROOT.glob("*.py")):
@@ -37,7 +36,7 @@ def commands() -> dict[str, str]:
 
 
 def overview() -> str:
-    """What there is and what to try first, as wide as the terminal."""
+    """The commands and what to try first, as wide as the terminal."""
     width = min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)
     found = commands()
     column = max(map(len, found)) + 4
@@ -53,29 +52,13 @@ def overview() -> str:
             for name, text in found.items()
         ),
         "",
-        "Try first: a few minutes of training, which end with a table and a rollout",
+        "Try first: a few minutes of training, then a table and a replay",
         *(f"  python -m modgnn_rl.{name} {settings}".rstrip() for name, settings in FIRST.items()),
         "",
-        "Every choice and every setting of a command",
+        "All choices and settings of a command",
         "  python -m modgnn_rl.train --help",
         "",
-        "Tab completes commands, choices and settings in bash (or zsh, fish) after",
+        "Tab completion of commands, choices and settings in bash (or zsh, fish)",
         '  eval "$(python -m modgnn_rl --completion bash)"',
     ]
     return "\n".join(lines)
-
-
-def completion(shell: str) -> str:
-    """The script after which a shell completes ``python -m modgnn_rl.<command>``, in the shell's own language.
-
-    Args:
-        shell: ``"bash"``, ``"zsh"`` or ``"fish"``.
-
-    Raises:
-        InputError: it is another one.
-    """
-    scripts = {path.suffix[1:]: path for path in sorted(Path(__file__).parent.glob("completion.*"))}
-    if shell not in scripts:
-        raise InputError(f"there is completion for {', '.join(scripts)}, not for {shell}{suggestion(shell, scripts)}")
-    modules = " ".join(f"modgnn_rl.{name}" for name in commands())
-    return scripts[shell].read_text(encoding="utf-8").replace("@MODULES@", modules)

@@ -9,15 +9,18 @@ import sys
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
+from modgnn_rl import registry
 from modgnn_rl.cli.command import run_command, settings_given
-from modgnn_rl.cli.overview import completion
-from modgnn_rl.configs.settings import setting
+from modgnn_rl.cli.tab import completion_script
+from modgnn_rl.configs.settings import group, setting
 from modgnn_rl.errors import InputError
+from modgnn_rl.registry import Registry
 from modgnn_rl.utils.signals import Stopped
 
 ROOT = Path(__file__).parents[2]
@@ -35,15 +38,24 @@ class World:
 class Trainer:
     """What the choices of the second group share."""
 
+    name: str = "bc"
     lr: float = setting(1e-3, "learning rate", gt=0, le=1)
+
+
+TOYS = Registry("trainer", "TOYS", "tests")
+TOYS.register("bc")(len)
 
 
 @dataclass
 class Dagger(Trainer):
     """A choice with settings of its own."""
 
+    name: str = "dagger"
     rounds: int = setting(10, "rounds of collection", ge=1)
     schedule: str = setting("linear", "mixing schedule", choices=("constant", "linear"))
+
+
+TOYS.register("dagger", settings=Dagger)(max)
 
 
 @dataclass
@@ -53,15 +65,14 @@ class Toy:
     seed: int = setting(0, "random seed, $5 or ${more}", ge=0)
     source: str = setting("here", "where from")
     env: World = field(default_factory=World)
-    trainer: Trainer = field(default_factory=Trainer)
+    trainer: Trainer = group(TOYS, Trainer)
 
 
 FILES = {
     "conf/toy.yaml": "defaults:\n  - toy_schema\n  - env: flocking\n  - trainer: dagger\n  - _self_\n",
     "conf/env/flocking.yaml": "{}\n",
     "conf/env/paper.yaml": "comm_range: 7\n",
-    "conf/trainer/bc.yaml": "{}\n",
-    "conf/trainer/dagger.yaml": "defaults:\n  - /trainer_dagger_schema@_here_\n",
+    "conf/trainer/patient.yaml": "defaults:\n  - dagger\nrounds: 99\n",
     "mine/trainer/mine.yaml": "defaults:\n  - dagger\nrounds: 4\n",
     "mine/trainer/wrong.yaml": "defaults:\n  - dagger\nroundz: 4\n",
     "mine/trainer/broken.yaml": "rounds: [4\n",
@@ -105,9 +116,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
         monkeypatch.setattr(sys, "argv", ["toy", *arguments])
         code: object = 0
         try:
-            run_command(
-                main or remember, Toy, "toy", nodes={"trainer/dagger": Dagger}, config_path=str(tmp_path / "conf")
-            )
+            run_command(main or remember, Toy, "toy", config_path=str(tmp_path / "conf"))
         except SystemExit as stop:
             code = stop.code
         assert Path.cwd() == workplace
@@ -125,6 +134,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
         (["seed=3", "env.num_agents=[8,16]"], Toy(3, env=World([8, 16]), trainer=Dagger())),
         (["env=paper", "trainer=bc"], Toy(env=World(comm_range=7), trainer=Trainer())),
         (["trainer.rounds=2", "env=paper", "env.comm_range=1"], Toy(env=World(comm_range=1), trainer=Dagger(rounds=2))),
+        (["trainer=patient"], Toy(trainer=Dagger(rounds=99))),
         (["--config-dir", "../mine", "trainer=mine"], Toy(trainer=Dagger(rounds=4))),
         (["hydra.searchpath=[file://../mine]", "trainer=mine"], Toy(trainer=Dagger(rounds=4))),
     ],
@@ -145,10 +155,12 @@ def test_settings_reach_main_as_the_dataclass(run: Run, arguments: list[str], ex
         (["++sed=1"], ["unknown setting sed", "'seed'"]),
         (["trainr=bc"], ["unknown setting trainr", "'trainer'"]),
         (["qqq=1"], ["unknown setting qqq", "--help"]),
-        (["~seed"], ["seed cannot be taken away"]),
-        (["trainer=dager"], ["trainer=dager is not one of bc, dagger", "did you mean 'dagger'?"]),
+        (["~seed"], ["seed cannot be removed"]),
+        (["trainer=dager"], ["trainer=dager is not one of bc, dagger, patient", "did you mean 'dagger'?"]),
         (["seed=x"], ["seed: ", "'x'", "Integer"]),
         (["seed=-1"], ["seed=-1 is out of range", "at least 0"]),
+        (["trainer=bc", "trainer.name=dagger"], ["trainer.name=dagger does not fit settings of type Trainer"]),
+        (["trainer.name=dager"], ["trainer 'dager' is not one of bc, dagger; did you mean 'dagger'?"]),
         (["trainer.lr=0"], ["trainer.lr=0.0 is out of range", "greater than 0"]),
         (["trainer.schedule=liner"], ["trainer.schedule=liner is not one of", "'linear'"]),
         (["env.num_agents=[8,0]"], ["env.num_agents", "at least 1"]),
@@ -243,6 +255,43 @@ def test_return_value_of_main_is_the_exit_code(run: Run) -> None:
     assert run("--multirun", "seed=0,4,1", main=lambda config: config.seed).code == 4
 
 
+def test_an_installed_package_is_imported_when_its_choice_is_used(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    imported = []
+
+    class Plugin(EntryPoint):
+        def load(self) -> object:
+            imported.append(self.name)
+            TOYS.register("plugged", settings=Plugged)(min)
+            return min
+
+    def entry_points(*, group: str, name: str = "plugged") -> EntryPoints:
+        return EntryPoints([Plugin("plugged", "a:b", group)]).select(name=name)
+
+    @dataclass
+    class Plugged(Trainer):
+        horizon: int = setting(5, "an installed package's own setting", ge=1)
+
+    monkeypatch.setattr(registry, "entry_points", entry_points)
+    monkeypatch.setattr(TOYS, "plugins", "toys")
+    monkeypatch.setattr(TOYS, "_added", dict(TOYS._added))
+    assert "trainer=bc, dagger*, patient, plugged" in " ".join(run("--help").out.split())
+    assert "did you mean 'plugged'?" in run("trainer=pluged").err
+    assert not imported
+    assert run("trainer=plugged", "trainer.horizon=3").configs == [Toy(trainer=Plugged("plugged", horizon=3))]
+    assert imported == ["plugged"]
+
+
+def test_settings_of_a_choice_must_be_derived_from_those_of_its_group(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TOYS, "_added", dict(TOYS._added))
+    TOYS.register("odd", settings=World)(min)
+    outcome = run()
+    assert (outcome.code, outcome.err.count("\n")) == (2, 1)
+    assert "trainer 'odd' is registered with settings=" in outcome.err
+    assert "expected a Trainer" in outcome.err
+
+
 def test_multirun_calls_main_for_every_combination(run: Run) -> None:
     outcome = run("--multirun", "seed=0,1", "trainer=bc,dagger")
     assert outcome.code == 0
@@ -261,7 +310,7 @@ def test_help_lists_choices_and_settings_with_doc_default_and_range(run: Run) ->
     for line in [
         "Fly a toy flock.",
         "env=flocking, paper*",
-        "trainer=bc, dagger*",
+        "trainer=bc, dagger*, patient",
         "seed=0 random seed, $5 or ${more} [at least 0]",
         "env.comm_range=7.0 hearing distance, m [greater than 0]",
         "trainer.lr=0.001 learning rate [greater than 0, at most 1]",
@@ -315,10 +364,10 @@ def test_tab_offers_nothing_of_hydra_itself(run: Run, monkeypatch: pytest.Monkey
 
 
 def test_the_script_for_a_shell_is_ours(run: Run) -> None:
-    assert run("-sc", "install=bash").out == f"{completion('bash')}\n"
+    assert run("-sc", "install=bash").out == f"{completion_script('bash')}\n"
     outcome = run("-sc", "install=tcsh")
     assert (outcome.code, outcome.out) == (2, "")
-    assert outcome.err == "error: there is completion for bash, fish, zsh, not for tcsh\n"
+    assert outcome.err == "error: unknown shell 'tcsh': there is completion for bash, fish, zsh\n"
 
 
 def test_a_broken_pipe_of_something_else_is_a_bug(run: Run) -> None:
@@ -330,7 +379,10 @@ def test_a_broken_pipe_of_something_else_is_a_bug(run: Run) -> None:
 
 
 def test_tab_completes_choices_and_settings(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    for typed, completions in [("trainer=", {"trainer=bc", "trainer=dagger"}), ("trainer.r", {"trainer.rounds="})]:
+    for typed, completions in [
+        ("trainer=", {"trainer=bc", "trainer=dagger", "trainer=patient"}),
+        ("trainer.r", {"trainer.rounds="}),
+    ]:
         line = f"toy {typed}"
         monkeypatch.setenv("COMP_LINE", line)
         monkeypatch.setenv("COMP_POINT", str(len(line)))

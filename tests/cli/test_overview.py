@@ -13,7 +13,8 @@ import pytest
 
 import modgnn_rl
 from modgnn_rl.__main__ import main
-from modgnn_rl.cli.overview import FIRST, commands, completion, overview
+from modgnn_rl.cli.overview import FIRST, commands, overview
+from modgnn_rl.cli.tab import completion_script
 
 ROOT = Path(__file__).parents[2]
 NAMES = {path.stem for path in (ROOT / "configs").glob("*.yaml")}  # each command has a file there
@@ -55,7 +56,7 @@ def test_it_is_as_wide_as_the_terminal(monkeypatch, width):
             ["--completion", "fisch"],
             2,
             "",
-            "error: there is completion for bash, fish, zsh, not for fisch; did you mean",
+            "error: unknown shell 'fisch': there is completion for bash, fish, zsh; did you mean",
         ),
     ],
 )
@@ -81,7 +82,7 @@ try 'python setup.py b'
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
 def test_tab_in_bash(tmp_path):
-    script = completion("bash") + BASH.format(python=shlex.quote(sys.executable))
+    script = completion_script("bash") + BASH.format(python=shlex.quote(sys.executable))
     done = subprocess.run(
         ["bash", "--norc", "-c", script], env=ENVIRONMENT, cwd=tmp_path, capture_output=True, text=True, timeout=60
     )
@@ -110,5 +111,5 @@ def test_a_reader_that_has_left_is_no_error():
 def test_other_shells_can_read_their_script(shell):
     if shutil.which(shell) is None:
         pytest.skip(f"no {shell}")
-    done = subprocess.run([shell, "-n"], input=completion(shell), capture_output=True, text=True, timeout=60)
+    done = subprocess.run([shell, "-n"], input=completion_script(shell), capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

@@ -218,7 +218,7 @@ def test_a_mistake_that_training_finds_is_one_line_and_leaves_nothing(tmp_path, 
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
     monkeypatch.setattr(sys, "argv", ["train", *arguments])
     with pytest.raises(SystemExit) as stopped:
-        run_command(main, TrainConfig, "train", nodes={"trainer/dagger": DAggerConfig})
+        run_command(main, TrainConfig, "train")
     error = capsys.readouterr().err
     assert stopped.value.code == 2
     assert words in error
