@@ -4,10 +4,10 @@ A setting is declared once, in a dataclass beside the code it configures::
 
     @dataclass
     class FlockingConfig:
-        comm_range: float = setting(3.5, "distance within which agents hear each other, m", gt=0)
+        comm_range: float = setting(3.5, "distance within which agents hear each other (m)", gt=0)
 
-:func:`check` then holds any such dataclass (nested ones too) against the declared ranges, both for the command
-line and for people who build the objects in Python.
+`check` compares any such dataclass, including nested ones, with the declared ranges: on the command line, and for
+objects built in Python.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ def setting(
 
     Args:
         default: default value; lists are copied for each instance.
-        help: one line that says what the setting does, with its unit.
+        help: one line that says what the setting does, with its unit in brackets.
         ge: smallest legal value.
         gt: exclusive lower bound.
         le: largest legal value.
-        choices: the legal values, where they can be listed; a registry (its names), which may grow later.
-        whole: accept whole numbers and lists of them only; for settings that may be either.
+        choices: the legal values, if they can be listed, or a registry, whose names they are.
+        whole: accept only integers and lists of integers, for settings typed as `Any`.
         length: length of a list.
     """
     metadata: dict[str, Any] = {"help": help, "ge": ge, "gt": gt, "le": le, "whole": whole, "length": length}
@@ -73,14 +73,14 @@ def group(registry: Mapping[str, Any], base: type, *, required: bool = False) ->
 
 
 def check(config: Any, path: str = "") -> None:
-    """Hold every setting of a dataclass against its declared range.
+    """Check every setting of a dataclass against its declared range.
 
     Args:
-        config: a dataclass instance whose fields were declared with :func:`setting`; nested dataclasses are followed.
-        path: how the user addresses ``config`` on the command line, for example ``env``.
+        config: a dataclass instance whose fields were declared with `setting`; nested dataclasses are followed.
+        path: name of ``config`` on the command line, for example ``env``.
 
     Raises:
-        InputError: the first setting that is out of range, with what was expected.
+        InputError: the first setting out of range, with what was expected.
     """
     for field in dataclasses.fields(config):
         name = f"{path}.{field.name}" if path else field.name
@@ -105,7 +105,7 @@ def _check_group(name: str, value: Any, registry: Any) -> None:
 
 
 def _check_list(name: str, value: Any, rule: Any) -> None:
-    """Raise InputError unless a value, or each item of a list, obeys the metadata written by `setting`."""
+    """Raise InputError unless a value, or each item of a list, obeys the range declared with `setting`."""
     items = list(value) if isinstance(value, (list, tuple)) else [value]
     length = rule["length"] or max(1, len(items))
     if len(items) != length:
@@ -115,7 +115,7 @@ def _check_list(name: str, value: Any, rule: Any) -> None:
 
 
 def _check_value(name: str, value: Any, rule: Any) -> None:
-    """Raise InputError unless one value obeys the metadata written by `setting`."""
+    """Raise InputError unless one value obeys the range declared with `setting`."""
     choices = rule["choices"]
     if choices is not None and value not in choices:
         hint = suggestion(str(value), [str(choice) for choice in choices])
@@ -139,7 +139,7 @@ def _check_value(name: str, value: Any, rule: Any) -> None:
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names, as in ``{"env.comm_range": 3.5}``."""
+    """Nested settings by dotted name, as in ``{"env.comm_range": 3.5}``."""
     leaves: dict[str, Any] = {}
     for key, value in tree.items():
         leaves |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}

@@ -1,4 +1,4 @@
-"""``python -m modgnn_rl.collect episodes=1000``: the expert's rollouts as a dataset to keep."""
+"""``python -m modgnn_rl.collect episodes=1000``: collect expert rollouts into a dataset."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from modgnn_rl.configs.schema import CollectConfig
 
 
 def main(config: CollectConfig) -> None:
-    """Fly the expert and write its rollouts to a dataset that trainer=bc reads; started again, it goes on.
+    """Collect expert rollouts into a dataset for trainer=bc; re-running resumes an unfinished dataset.
 
     Examples::
 

@@ -1,4 +1,4 @@
-"""``python -m modgnn_rl.evaluate run=<folder>``: how well the policy of a run flies."""
+"""``python -m modgnn_rl.evaluate run=<folder>``: evaluate the policy of a run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from modgnn_rl.tracking.run_folder import RunFolder
 
 
 def main(config: EvaluateConfig) -> None:
-    """Fly a trained policy beside its expert and beside doing nothing, and print and save the table.
+    """Evaluate a policy against the expert and a zero-action baseline.
 
     Examples::
 

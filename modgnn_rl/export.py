@@ -1,4 +1,4 @@
-"""``python -m modgnn_rl.export run=<folder>``: the policy of a run as files that fly a robot."""
+"""``python -m modgnn_rl.export run=<folder>``: export the policy of a run to robots."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REPEATS = 300
 
 
 def main(config: ExportConfig) -> None:
-    """Export the policy of a run, agent by agent, to files that fly with numpy and onnxruntime alone.
+    """Export a policy as an agent that runs on a robot with numpy and onnxruntime alone.
 
     Examples::
 

@@ -1,4 +1,4 @@
-"""``python -m modgnn_rl.replay run=<folder>``: a rollout of a run's policy to look at."""
+"""``python -m modgnn_rl.replay run=<folder>``: show a rollout of a run's policy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EXTRAS = {"mp4": "video", "svg": "plots", "png": "plots"}
 
 
 def main(config: ReplayConfig) -> None:
-    """Fly a flock with a trained policy, and write a page, a film or a picture of it, beside the expert's rollout.
+    """Show a rollout of a policy beside the expert's, as a web page, a video or an image.
 
     Examples::
 

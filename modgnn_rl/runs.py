@@ -1,4 +1,4 @@
-"""``python -m modgnn_rl.runs``: which runs there are, how they stand, and what tells them apart."""
+"""``python -m modgnn_rl.runs``: list runs, or compare them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["find_run", "show_runs"]
 
 
 def main(config: RunsConfig) -> None:
-    """List runs with their state and main figures, or compare some, from their plain files alone.
+    """List runs with their state and main metrics, or compare some of them.
 
     Examples::
 

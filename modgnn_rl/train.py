@@ -1,4 +1,4 @@
-"""``python -m modgnn_rl.train``: train a policy and see how well it flies."""
+"""``python -m modgnn_rl.train``: train a policy and evaluate it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from modgnn_rl.tracking.run_folder import RunFolder
 
 
 def main(config: TrainConfig) -> None:
-    """Train a decentralised flocking policy from the Reynolds expert, and compare it with the expert.
+    """Train a decentralised flocking policy to imitate the Reynolds expert, and evaluate it against the expert.
 
     Examples::
 
@@ -21,7 +21,7 @@ def main(config: TrainConfig) -> None:
         python -m modgnn_rl.train model=modgnn_mlp trainer=bc seed=1
         python -m modgnn_rl.train 'resume=runs/<date>-<name>'
     """
-    # Folders are looked at before the heavy imports: a typing error must be reported at once.
+    # Folders are checked before the heavy imports, so that a typing error is reported at once.
     for folder in (config.resume, config.init_from):
         if folder is not None:
             RunFolder.open(folder)

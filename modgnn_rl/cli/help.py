@@ -1,4 +1,4 @@
-"""What ``--help`` of a command prints: what it does, examples, choices, and every setting with its doc and range."""
+"""The ``--help`` of a command: summary, examples, choices, and every setting with its documentation and range."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from omegaconf import DictConfig, OmegaConf
 __all__ = ["FLAGS", "children", "fields", "help_text", "legal_values"]
 
 FLAGS = {
-    "--multirun": "one run for every combination of comma-separated values, as in seed=0,1,2",
-    "--config-dir DIR": "also look for choices in DIR, for example DIR/trainer/mine.yaml for trainer=mine",
-    "--cfg job": "print the resolved configuration and stop",
-    "--help": "this text, for the choices and settings given beside it",
+    "--multirun": "one run for each combination of comma-separated values, as in seed=0,1,2",
+    "--config-dir DIR": "further choices as YAML files, for example DIR/env/mine.yaml for env=mine",
+    "--cfg job": "print the configuration and exit",
+    "--help": "print this help, for the choices and settings on the command line",
 }
 
 
 def help_text(main: Callable[..., Any], name: str, config: DictConfig) -> str:
-    """The help on a composed configuration, as wide as the terminal.
+    """The help text for a composed configuration, as wide as the terminal.
 
     Args:
         main: the command; its docstring, examples included, heads the help.
         name: of the command.
-        config: the whole configuration, Hydra's own part included.
+        config: the whole configuration, including Hydra's own part.
     """
     width = min(max(shutil.get_terminal_size((120, 24)).columns, 60), 120)
     choices = list(_choices(config, width))
@@ -46,7 +46,7 @@ def help_text(main: Callable[..., Any], name: str, config: DictConfig) -> str:
 
 
 def children(config: DictConfig) -> Iterator[tuple[str, DictConfig]]:
-    """Yield the nodes of a configuration that have settings of their own."""
+    """Yield the nodes of a configuration that are dataclasses themselves."""
     for key in map(str, config):
         if OmegaConf.is_missing(config, key) or OmegaConf.is_interpolation(config, key):
             continue
@@ -60,7 +60,7 @@ def fields(config: DictConfig) -> tuple[dataclasses.Field[Any], ...]:
 
 
 def _choices(config: DictConfig, width: int) -> Iterator[str]:
-    """Yield the help on every group of the command: its choices, the one in use marked."""
+    """Yield the choices of each group of the command, the one in use marked."""
     loader = GlobalHydra.instance().config_loader()
     chosen = config.hydra.runtime.choices
     for group in sorted(set(loader.list_groups("")) & set(chosen)):
@@ -71,11 +71,11 @@ def _choices(config: DictConfig, width: int) -> Iterator[str]:
 
 
 def _settings(config: DictConfig, width: int, prefix: str = "") -> Iterator[list[str]]:
-    """Yield heading and lines for a configuration, then for each that is nested in it."""
+    """Yield heading and lines for a configuration, then for each one nested in it."""
     raw = typing.cast(dict[str, Any], OmegaConf.to_container(config, resolve=False))
     names = {field.name for field in fields(config)}
-    nested = {name: child for name, child in children(config) if name in names}  # beside it lies Hydra's own part
-    heading = f"{prefix}* {_summary(config)}" if prefix else "Settings, with the values they have under these choices"
+    nested = {name: child for name, child in children(config) if name in names}  # without Hydra's own part
+    heading = f"{prefix}* {_summary(config)}" if prefix else "Settings, with their values under these choices"
     lines = [textwrap.fill(heading.strip(), width)]
     for field in fields(config):
         if field.name not in nested:
@@ -84,20 +84,20 @@ def _settings(config: DictConfig, width: int, prefix: str = "") -> Iterator[list
             head = f"{prefix}{field.name}={'<required>' if value == '???' else shown}"
             lines.append(_entry(head, f"{field.metadata.get('help', '')}{legal_values(field.metadata)}", width))
     yield lines
-    # The shortest first: the long list of the world's would hide the others.
+    # Shortest first: the long list of the environment would hide the others.
     for name in sorted(nested, key=lambda name: len(nested[name])):
         yield from _settings(nested[name], width, f"{prefix}{name}.")
 
 
 def _summary(config: DictConfig) -> str:
-    """The first line of the docstring of the dataclass behind a configuration, if somebody wrote one."""
+    """The first line of the docstring of the dataclass behind a configuration, unless Python generated it."""
     kind = typing.cast(type, OmegaConf.get_type(config))
     doc = kind.__doc__ or ""
     return "" if doc.startswith(f"{kind.__name__}(") else doc.partition("\n")[0].replace("`", "")
 
 
 def _entry(head: str, text: str, width: int) -> str:
-    """A word with its explanation beside it, or below it where it is too long for that."""
+    """A term with its explanation next to it, or below it if the term is long."""
     head = f"  {head}"
     indent = " " * (40 if width >= 100 else 30)
     body = textwrap.fill(text, width, initial_indent=indent, subsequent_indent=indent)

@@ -13,8 +13,9 @@ from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig, ScaleConfi
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.reporting.table import as_csv
-from modgnn_rl.reproduce import claim_folder, main
+from modgnn_rl.reproduce import main
 from modgnn_rl.reproduction.claims import CLAIMS, Claim, Side, claim_tables, judge
+from modgnn_rl.reproduction.folder import claim_folder
 from modgnn_rl.reproduction.measurements import VALIDATION, Measurements
 from modgnn_rl.reproduction.pages import write_study
 from modgnn_rl.reproduction.paper_tables import paper_tables, published
@@ -235,7 +236,7 @@ def test_a_folder_keeps_to_its_settings(tmp_path):
     config = ReproduceConfig(folder=folder, env=FlockingConfig(leader_max_speed=math.inf))
     assert claim_folder(config) == claim_folder(dataclasses.replace(config, seeds=5, study="range", after="dagger"))
     changed = dataclasses.replace(config, scale=dataclasses.replace(config.scale, updates=7))
-    with pytest.raises(InputError, match=r"was begun with scale.updates=6000"):
+    with pytest.raises(InputError, match=r"was started with scale.updates=6000"):
         claim_folder(changed)
     (tmp_path / "one" / "settings.json").write_text("{")
     with pytest.raises(InputError, match="damaged"):
