@@ -1,0 +1,105 @@
+"""Imports run one way: no cycle between packages, and the flocking task is known in few places only."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+LINKED = ("configs", "envs", "trainers")  # folders at the top, imported as modgnn_rl.<name>
+
+
+def modules() -> dict[str, Path]:
+    """Every module of the library and its file."""
+    found = {}
+    for top in ("modgnn_rl", *LINKED):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            parts = parts if top == "modgnn_rl" else ("modgnn_rl", *parts)
+            if top == "modgnn_rl" and parts[1] in LINKED:
+                continue
+            found[".".join(part for part in parts if part != "__init__")] = path
+    return found
+
+
+MODULES = modules()
+
+
+def imports(module: str) -> set[str]:
+    """The modules of the library that a module imports, in functions too, but not for type checking alone."""
+    return {
+        name if name in MODULES else name.rpartition(".")[0]
+        for name in _imported_names(ast.parse(MODULES[module].read_text(encoding="utf-8")))
+        if name.partition(".")[0] == "modgnn_rl"
+    } - {module}
+
+
+def _imported_names(node: ast.AST) -> Iterator[str]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(child, ast.Import):
+            yield from (alias.name for alias in child.names)
+        elif isinstance(child, ast.ImportFrom) and child.module:
+            yield from (f"{child.module}.{alias.name}" for alias in child.names)
+        yield from _imported_names(child)
+
+
+def package(module: str) -> str:
+    """The part of the library that a module belongs to: ``modgnn_rl.nn``, or a module at the top by itself."""
+    return ".".join(module.split(".")[:2])
+
+
+def is_flocking(module: str) -> bool:
+    """Whether a module is part of the flocking task; ``modgnn_rl.envs`` exports its environment."""
+    return module == "modgnn_rl.envs" or module.startswith("modgnn_rl.envs.flocking")
+
+
+# Parts that are to know a task by `modgnn_rl.task` alone, once it is there.
+INDEPENDENT = ("trainers", "evaluation", "tracking", "visualization")
+
+# Modules in these parts that still import the flocking task, and what for. To shrink to nothing; never to grow.
+REMAINING = {
+    "modgnn_rl.evaluation.rollout",  # the expert and the metrics of an episode
+    "modgnn_rl.trainers.collectors.local",  # the environment that is rolled out
+    "modgnn_rl.trainers.loop.context",  # the expert
+    "modgnn_rl.trainers.loop.metrics",  # metrics of an episode, terms of the reward
+    "modgnn_rl.trainers.loop.setup",  # checks that the environment can be built
+    "modgnn_rl.visualization.html",  # the recording that is drawn
+    "modgnn_rl.visualization.picture",
+    "modgnn_rl.visualization.recording",
+}
+
+
+def test_there_is_no_import_cycle_between_packages() -> None:
+    graph: dict[str, set[str]] = {}
+    for module in MODULES:
+        others = {package(imported) for imported in imports(module)} - {package(module)}
+        graph.setdefault(package(module), set()).update(others)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"packages import each other in a circle: {' -> '.join(reversed(error.args[1]))}")
+
+
+@pytest.mark.parametrize("part", INDEPENDENT)
+def test_the_flocking_task_is_imported_where_listed_only(part: str) -> None:
+    found = {
+        module
+        for module in MODULES
+        if package(module) == f"modgnn_rl.{part}" and any(map(is_flocking, imports(module)))
+    }
+    listed = {module for module in REMAINING if package(module) == f"modgnn_rl.{part}"}
+    assert found - listed == set(), "import modgnn_rl.task instead"
+    assert listed - found == set(), "remove these from REMAINING: they no longer import the flocking task"
+
+
+def test_the_reader_of_imports_sees_what_it_should() -> None:
+    assert "modgnn_rl.configs.schema" in imports("modgnn_rl.train")
+    assert "modgnn_rl.experiment.training" in imports("modgnn_rl.train")  # in a function
+    assert "modgnn_rl.envs" in MODULES
+    assert "modgnn_rl.envs.flocking.env" in imports("modgnn_rl.envs")
