@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import pkgutil
 import re
 import subprocess
 import sys
@@ -21,7 +23,7 @@ PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SETUPTOOLS: dict[str, Any] = PROJECT["tool"]["setuptools"]
 
 # Distributions whose module has another name.
-MODULES = {"hydra-core": "hydra", "pyyaml": "yaml"}
+MODULES = {"hydra-core": "hydra", "lazy-loader": "lazy_loader", "pyyaml": "yaml"}
 
 
 def sources(*folders: str) -> list[Path]:
@@ -118,9 +120,34 @@ def test_importing_the_package_and_its_settings_does_not_load_torch() -> None:
     assert (process.stdout, process.stderr) == ("False\n", "")
 
 
-@pytest.mark.parametrize("name", modgnn_rl.__all__)
-def test_public_names_resolve(name: str) -> None:
-    assert getattr(modgnn_rl, name) is not None
+def exporting_packages() -> list[str]:
+    """The packages that export names of their modules, as their ``__init__.pyi`` lists them."""
+    folders = [ROOT / "modgnn_rl", *(ROOT / "modgnn_rl" / folder for folder in LINKED)]
+    stubs = {path for folder in folders for path in folder.rglob("__init__.pyi")}
+    return sorted(".".join(path.relative_to(ROOT).parent.parts) for path in stubs)
+
+
+@pytest.mark.parametrize("package", exporting_packages())
+def test_exported_names_resolve_and_are_not_those_of_submodules(package: str) -> None:
+    module = importlib.import_module(package)
+    submodules = {found.name for found in pkgutil.iter_modules(module.__path__)}
+    assert module.__all__
+    assert set(module.__all__) & submodules == set()
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+    stub = ast.parse((Path(module.__path__[0]) / "__init__.pyi").read_text())
+    for node in stub.body:
+        for alias in node.names if isinstance(node, ast.ImportFrom) else []:
+            assert alias.asname == alias.name  # so that type checkers take it as exported
+            home = importlib.import_module(f"{package}.{node.module}")
+            assert getattr(module, alias.name) is getattr(home, alias.name)
+            assert alias.name in home.__all__
+
+
+def test_importing_a_package_does_not_load_torch() -> None:
+    code = f"import sys, {', '.join(exporting_packages())}; print('torch' in sys.modules)"
+    process = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (process.stdout, process.stderr) == ("False\n", "")
 
 
 def test_readme_has_one_line_to_run_and_one_to_test() -> None:
