@@ -139,7 +139,7 @@ def test_names() -> None:
     [
         (
             {"num_envs": 2},
-            r"its perturbations\.active is bool \[2, 5\], that of this environment is bool \[3, 5\]",
+            r"its leader\.velocity is float32 \[2, 3\], that of this environment is float32 \[3, 3\]",
         ),
         ({"num_agents": 4}, r"perturbations\.active is bool \[3, 4\]"),
         ({"delay": 2}, r"perturbations\.delayed is float32 \[2, 3, 5, 6\]"),
