@@ -11,5 +11,5 @@ if "modgnn_rl/Flocking-v0" not in registry:
     register(
         id="modgnn_rl/Flocking-v0",
         entry_point="modgnn_rl.envs.flocking.adapters.gymnasium_env:GymnasiumFlocking",
-        vector_entry_point="modgnn_rl.envs.flocking.adapters.gymnasium_env:GymnasiumFlocks",
+        vector_entry_point="modgnn_rl.envs.flocking.adapters.gymnasium_env:GymnasiumVectorFlocking",
     )

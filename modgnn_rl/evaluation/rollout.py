@@ -140,7 +140,7 @@ def rollout(
         progress: counts flock-steps.
         expert: what errors are measured against, writes ``("agents", "expert_action")``; default: Reynolds flocking.
         watch: is shown the flocks before each step, with both actions; see
-            `modgnn_rl.envs.flocking.recording.Recorder`.
+            `modgnn_rl.envs.flocking.recording.FlockRecorder`.
     """
     env = make_eval_env(policy, config, num_flocks, num_agents, steps=steps, seed=seed, device=device)
     expert = expert or Reynolds.for_env(config)

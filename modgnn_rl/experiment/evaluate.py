@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, as_list
 from modgnn_rl.configs.settings import check
-from modgnn_rl.envs.flocking.recording import Recorder, spacing
+from modgnn_rl.envs.flocking.recording import FlockRecorder
 from modgnn_rl.evaluation.rollout import evaluate
 from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_rollouts
 from modgnn_rl.nn.modgnn import ModGNN
@@ -19,6 +19,7 @@ from modgnn_rl.tracking.loading import load_policy, override_env_config
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.visualization.html import write_replay
+from modgnn_rl.visualization.recording import recording_stride
 
 __all__ = ["REPLAY_FRAMES", "evaluate_policies", "evaluate_run", "evaluation_file"]
 
@@ -45,8 +46,8 @@ def evaluate_policies(
     """
     tables, replays = {}, {}
     for size in sizes:
-        stride = spacing(size, settings.steps, REPLAY_FRAMES)
-        replays[size] = {name: Recorder(env_config, stride) for name in (*policies, "expert")}
+        stride = recording_stride(size, settings.steps, REPLAY_FRAMES)
+        replays[size] = {name: FlockRecorder(env_config, stride) for name in (*policies, "expert")}
         rollouts = evaluate(
             policies,
             env_config,

@@ -10,15 +10,15 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig, as_list
 from modgnn_rl.configs.settings import check
-from modgnn_rl.envs.flocking.recording import Recording, spacing
 from modgnn_rl.errors import InputError
+from modgnn_rl.evaluation.recording import record
 from modgnn_rl.evaluation.rollout import reference_policies
 from modgnn_rl.tracking.loading import load_policy, override_env_config
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.visualization.html import write_replay
-from modgnn_rl.visualization.recording import record
+from modgnn_rl.visualization.recording import Recording, recording_stride
 
 __all__ = ["replay_run"]
 
@@ -49,11 +49,12 @@ def replay_run(config: ReplayConfig) -> Path:
     }  # fmt: skip
     try:
         if config.format == "mp4":
-            from modgnn_rl.visualization.video import film, write_video
+            from modgnn_rl.visualization.video import VIDEO_STRIDE, check_video, write_video
 
-            write_video(path, film(policy, env_config, **rollout), env_config.control_frequency)
+            check_video()
+            write_video(path, record(policy, env_config, stride=VIDEO_STRIDE, **rollout))
             return path
-        stride = config.stride or spacing(agents, config.steps)
+        stride = config.stride or recording_stride(agents, config.steps)
         still = config.format in ("svg", "png")
         shown = config.steps - 1 if config.step is None else config.step
         if still:  # nothing after it is seen
@@ -62,9 +63,9 @@ def replay_run(config: ReplayConfig) -> Path:
         facts = {"run": run.path.name, "flown": f"{agents} agents, {config.steps} steps, seed {config.seed}"}
         facts |= {"checkpoint": config.checkpoint} | {f"env.{key}": value for key, value in changes.items()}
         if still:
-            from modgnn_rl.visualization.picture import write_picture
+            from modgnn_rl.visualization.image import write_image
 
-            write_picture(path, recordings, shown)
+            write_image(path, recordings, shown)
         else:
             write_replay(path, recordings, f"{run.path.name}: {name}", facts)
     except OSError as error:
@@ -106,6 +107,6 @@ def _fly_all(
             if config.viewer and not recordings:
                 from modgnn_rl.visualization.viewer import Viewer
 
-                viewer = stack.enter_context(Viewer(env_config, config.port))
-            recordings[name] = record(policy, env_config, stride=stride, progress=progress, watch=viewer, **rollout)
+                viewer = stack.enter_context(Viewer(env_config.control_frequency, config.port))
+            recordings[name] = record(policy, env_config, stride=stride, progress=progress, on_frame=viewer, **rollout)
     return recordings

@@ -1,1 +1,1 @@
-"""Replays, images and videos of rollouts."""
+"""Drawing of recorded rollouts: replay page, images, videos, live viewer. Nothing here depends on the task."""

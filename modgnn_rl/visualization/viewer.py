@@ -1,4 +1,4 @@
-"""A rollout watched in a browser while it is flown, on this machine alone; needs ``modgnn-rl[viewer]``."""
+"""A live view of a rollout in a browser on the same machine; needs ``modgnn-rl[viewer]``."""
 
 from __future__ import annotations
 
@@ -8,34 +8,32 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
 
-from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.errors import InputError
-from modgnn_rl.nn.topology import as_matrix
+from modgnn_rl.visualization.recording import Frame, shortest_edges
 
 __all__ = ["Viewer"]
 
 HOST = "127.0.0.1"
-PATIENCE = 30.0  # s to wait for a browser before the rollout begins without one
-MOST_LINKS = 3000  # the shortest are drawn
-PICTURES = 24.0  # a second at most
-COLOURS = {"agent": (23, 32, 51), "leader": (208, 31, 46), "link": (227, 181, 5), "target": (27, 98, 208)}
+BROWSER_TIMEOUT = 30.0  # s to wait for a browser before the rollout starts without one
+MAX_EDGES = 3000  # the shortest are drawn
+MAX_RATE = 24.0  # frames per second
+COLOURS = {"agent": (23, 32, 51), "leader": (208, 31, 46), "edge": (227, 181, 5), "target": (27, 98, 208)}
 
 
 class Viewer:
-    """Shows the first flock that `modgnn_rl.evaluation.rollout.rollout` shows it, at the pace of its clock or slower.
+    """Shows frames at the pace of the control frequency, or slower. A context manager; call it with each frame.
 
     Args:
-        config: the world.
-        port: where a browser finds it, on this machine.
-        patience: longest wait for a browser before the rollout begins, s.
+        frequency: control frequency, Hz.
+        port: port of the web page, on this machine.
+        timeout: longest wait for a browser before the rollout starts, s.
 
     Raises:
-        InputError: viser is not installed, or the port is taken.
+        InputError: viser is not installed, or the port is in use.
     """
 
-    def __init__(self, config: FlockingConfig, port: int, patience: float = PATIENCE) -> None:
+    def __init__(self, frequency: float, port: int, timeout: float = BROWSER_TIMEOUT) -> None:
         try:
             import viser
         except ImportError as error:
@@ -47,64 +45,60 @@ class Viewer:
             try:
                 probe.bind((HOST, port))
             except OSError as error:
-                raise InputError(f"port={port} cannot be used ({error.strerror}); give another one") from error
-        self.config, self.patience = config, patience
+                raise InputError(f"port={port} cannot be used ({error.strerror}); choose another one") from error
+        self.frequency, self.timeout = frequency, timeout
         self.server: Any = viser.ViserServer(host=HOST, port=port, verbose=False)
         self.server.scene.set_up_direction("+z")
         self.server.scene.add_grid("/floor", width=40.0, height=40.0, cell_size=1.0, position=(0.0, 0.0, -5.0))
         self.follows = self.server.gui.add_checkbox("Follow the flock", True)
-        self.shows_links = self.server.gui.add_checkbox("Links", True)
+        self.shows_edges = self.server.gui.add_checkbox("Edges", True)
         self.clock = self.server.gui.add_text("Time", "0.0 s", disabled=True)
         self.url = f"http://{HOST}:{port}"
         self.steps = 0
-        self.begun = self.drawn = 0.0
+        self.started = self.drawn = 0.0
 
     def __enter__(self) -> Self:
-        """Say where to look, and wait a while for somebody to do so."""
+        """Print the address, and wait for a browser."""
         print(
-            f"Watch at {self.url}; the rollout begins when a browser is there, or in {self.patience:.0f} s", flush=True
+            f"Open {self.url} to watch; the rollout starts when a browser connects, or in {self.timeout:.0f} s",
+            flush=True,
         )
-        end = time.monotonic() + self.patience
+        end = time.monotonic() + self.timeout
         while not self.server.get_clients() and time.monotonic() < end:
             time.sleep(0.1)
-        self.begun = time.monotonic()
+        self.started = time.monotonic()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the server."""
+        """Stop the server."""
         self.server.stop()
 
-    def __call__(self, tensordict: TensorDictBase) -> None:
-        """Show the flock before a step, and wait until it is due."""
-        due = self.begun + self.steps / self.config.control_frequency
+    def __call__(self, frame: Frame) -> None:
+        """Wait until the frame is due, and show it."""
+        due = self.started + self.steps / self.frequency
         if (early := due - time.monotonic()) > 0:
             time.sleep(early)
         else:
-            self.begun -= early  # a rollout that is slower than its clock does not hurry afterwards
-        if self.steps == 0 or time.monotonic() - self.drawn > 1 / PICTURES:
+            self.started -= early  # a rollout that falls behind does not catch up
+        if self.steps == 0 or time.monotonic() - self.drawn > 1 / MAX_RATE:
             self.drawn = time.monotonic()
-            self.clock.value = f"{self.steps / self.config.control_frequency:.1f} s"
-            self._draw(tensordict[0])
+            self.clock.value = f"{self.steps / self.frequency:.1f} s"
+            self._draw(frame)
         self.steps += 1
 
-    def _draw(self, flock: TensorDictBase) -> None:
-        position = flock[self.config.state_key][..., :3].cpu().numpy()
-        target = flock["agents", "action"].cpu().numpy()
-        if self.follows.value:
-            position = position - position.mean(0)
-        adjacency = as_matrix(flock["adjacency"].unsqueeze(0), len(position))[0].cpu().numpy()
-        pairs = np.argwhere(np.triu(adjacency | adjacency.T, 1))
-        length = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=-1)
-        pairs = pairs[np.argsort(length)[:MOST_LINKS]] if self.shows_links.value else pairs[:0]
+    def _draw(self, frame: Frame) -> None:
+        position = frame.position - (frame.position.mean(0) if self.follows.value else 0.0)
+        position, target = position.astype(np.float32), frame.target_velocity.astype(np.float32)
+        pairs = shortest_edges(frame, MAX_EDGES if self.shows_edges.value else 0)
         scene = self.server.scene
         with self.server.atomic():
             scene.add_point_cloud("/agents", position[1:], COLOURS["agent"], point_size=0.12, point_shape="circle")
             scene.add_point_cloud("/leader", position[:1], COLOURS["leader"], point_size=0.24, point_shape="diamond")
-            for name, lines in (("link", position[pairs]), ("target", np.stack((position, position + target), 1)[1:])):
-                self._lines(name, lines)
+            for name, lines in (("edge", position[pairs]), ("target", np.stack((position, position + target), 1)[1:])):
+                self._add_lines(name, lines)
 
-    def _lines(self, name: str, lines: NDArray[Any]) -> None:
-        """Show lines [L, 2, 3]; none at all are one without length."""
+    def _add_lines(self, name: str, lines: NDArray[Any]) -> None:
+        """Show lines [L, 2, 3]; without any, one of zero length."""
         lines = lines if len(lines) else np.zeros((1, 2, 3), np.float32)
         width = 2.5 if name == "target" else 1.0
         self.server.scene.add_line_segments(f"/{name}", lines, COLOURS[name], line_width=width)

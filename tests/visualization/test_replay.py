@@ -1,4 +1,4 @@
-"""Replays: what is kept of a rollout, and that the page gives it back in a real browser."""
+"""Replays: recordings of rollouts, and what the page shows of them in a real browser."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig
-from modgnn_rl.envs.flocking.recording import METRICS, QUANTUM, Recorder, Recording, spacing
+from modgnn_rl.envs.flocking.recording import FlockRecorder
 from modgnn_rl.errors import InputError
+from modgnn_rl.evaluation.recording import record
 from modgnn_rl.evaluation.rollout import reference_policies, rollout
 from modgnn_rl.nn.topology import as_matrix
 from modgnn_rl.replay import refuse
 from modgnn_rl.visualization import html
-from modgnn_rl.visualization.recording import record
+from modgnn_rl.visualization.recording import QUANTUM, MetricSeries, Recording, recording_stride
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 browser = importlib.import_module("browser")
@@ -27,17 +28,17 @@ browser = importlib.import_module("browser")
 needs_chromium = pytest.mark.skipif(
     browser.CHROMIUM is None, reason="no chromium on this machine: nothing to open a page with"
 )
-FAULTY = FlockingConfig(num_agents=7, message_loss=0.3, delay=1, range_spread=0.3, dropout_rate=2.0)
+PERTURBED = FlockingConfig(num_agents=7, message_loss=0.3, delay=1, range_spread=0.3, dropout_rate=2.0)
 
 
 def _record(env_config, agents=7, steps=30, stride=1, name="expert"):
-    """A recording, and for each step the links of the radio and the positions."""
-    recorder, seen = Recorder(env_config, stride), []
+    """A recording, and for each step the edges of the graph and the positions."""
+    recorder, seen = FlockRecorder(env_config, stride), []
 
     def watch(flocks):
         recorder(flocks)
-        links = as_matrix(flocks["adjacency"], agents)[0].flatten().nonzero().squeeze(-1)
-        seen.append((links.numpy(), flocks[env_config.state_key][0, :, :3].double().numpy()))
+        edges = as_matrix(flocks["adjacency"], agents)[0].nonzero()
+        seen.append((edges.numpy(), flocks[env_config.state_key][0, :, :3].double().numpy()))
 
     policy = reference_policies(env_config)[name]
     rollout(policy, env_config, num_agents=agents, num_flocks=2, steps=steps, seed=5, watch=watch)
@@ -45,24 +46,25 @@ def _record(env_config, agents=7, steps=30, stride=1, name="expert"):
 
 
 @pytest.mark.parametrize("graph", ["matrix", "links"])
-def test_links_are_those_of_the_radio_under_faults(graph):
-    recording, seen = _record(dataclasses.replace(FAULTY, graph=graph))
+def test_recorded_edges_are_those_of_the_perturbed_graph(graph):
+    recording, seen = _record(dataclasses.replace(PERTURBED, graph=graph))
     assert any(len(flips) for flips in recording.flips)
     assert not recording.present.all()
-    for step, (links, position) in enumerate(seen):
-        assert np.array_equal(recording.links(step), links)
+    for step, (edges, position) in enumerate(seen):
+        assert np.array_equal(recording.frame(step).edges, edges)
         assert np.abs(recording.position[step] * QUANTUM - position).max() <= QUANTUM / 2
 
 
-def test_some_of_the_steps_are_kept():
-    (all_steps, _), (some, _) = (_record(FAULTY, stride=stride) for stride in (1, 4))
+def test_a_stride_records_every_nth_step():
+    (all_steps, _), (some, _) = (_record(PERTURBED, stride=stride) for stride in (1, 4))
     assert np.array_equal(some.position, all_steps.position[::4])
-    assert np.array_equal(some.metrics["error"], all_steps.metrics["error"][::4])
-    assert (spacing(32, 1000), spacing(1000, 1000), spacing(32, 1000, 250), spacing(2, 10, 250)) == (1, 5, 4, 1)
+    assert np.array_equal(some.metrics["error"].values, all_steps.metrics["error"].values[::4])
+    cases = ((32, 1000), (1000, 1000), (32, 1000, 250), (2, 10, 250))
+    assert [recording_stride(*case) for case in cases] == [1, 5, 4, 1]
 
 
-def _unpack(data, agents, steps):
-    """What `html.pack` was given, by the words of its docstring."""
+def _unpack(data, agents, steps, num_metrics):
+    """Decode what `html.pack` encoded, following its docstring."""
     raw, place = gzip.decompress(data), 0
 
     def planes(count, integrations):
@@ -81,7 +83,7 @@ def _unpack(data, agents, steps):
     position, velocity = planes(4, 2), planes(2, 1)
     present = np.frombuffer(raw, np.uint8, agents * steps, place).reshape(agents, steps).T.astype(bool)
     place += agents * steps
-    metrics = np.frombuffer(raw, "<f4", len(METRICS) * steps, place).reshape(-1, steps)
+    metrics = np.frombuffer(raw, "<f4", num_metrics * steps, place).reshape(-1, steps)
     place += 4 * metrics.size
     numbers, value, shift = [], 0, 0
     for byte in raw[place:]:
@@ -98,36 +100,35 @@ def _unpack(data, agents, steps):
 
 
 @pytest.mark.parametrize("agents", [1, 200])
-def test_packing_loses_nothing(agents):
-    random, steps = np.random.default_rng(0), 9
-    links = agents * agents
+def test_packing_is_lossless(agents):
+    random, steps, pairs = np.random.default_rng(0), 9, agents**2
     recording = Recording(
         position=random.integers(-(2**28), 2**28, (steps, agents, 3), dtype=np.int32),
         target_velocity=random.uniform(-0.5, 0.5, (steps, agents, 3)).astype(np.float32),
         present=random.random((steps, agents)) < 0.5,
-        flips=[np.sort(random.choice(links, int(random.integers(0, links)), replace=False)) for _ in range(steps)],
-        metrics={name: random.random(steps) for name in METRICS},
+        flips=[np.sort(random.choice(pairs, int(random.integers(0, pairs)), replace=False)) for _ in range(steps)],
+        metrics={name: MetricSeries(name, "m", random.random(steps)) for name in ("error", "cohesion")},
         stride=1,
         comm_range=3.5,
         max_speed=0.92,
         frequency=48.0,
     )
-    position, velocity, present, metrics, flips = _unpack(html.pack(recording), agents, steps)
+    position, velocity, present, metrics, flips = _unpack(html.pack(recording), agents, steps, 2)
     assert np.array_equal(position, recording.position)
     assert np.abs(velocity * 0.92 / html.VELOCITY_STEPS - recording.target_velocity).max() < 0.0037
     assert np.array_equal(present, recording.present)
-    assert np.array_equal(metrics, np.stack([recording.metrics[name] for name in METRICS]).astype("f4"))
+    assert np.array_equal(metrics, np.stack([series.values for series in recording.metrics.values()]).astype("f4"))
     assert all(np.array_equal(one, other) for one, other in zip(flips, recording.flips, strict=True))
 
 
-def _page(tmp_path, env_config=FAULTY, names=("expert", "zero action"), title="a </script> title", **rollout):
+def _page(tmp_path, env_config=PERTURBED, names=("expert", "zero action"), title="a </script> title", **rollout):
     recordings = {name: _record(env_config, name=name, **rollout)[0] for name in names}
     path = tmp_path / "replay.html"
     html.write_replay(path, recordings, title, {"seed": 5})
     return path
 
 
-def test_the_page_asks_for_nothing_and_shows_names_as_they_are(tmp_path):
+def test_the_page_loads_nothing_and_escapes_names(tmp_path):
     text = _page(tmp_path, steps=4).read_text(encoding="utf-8")
     assert "default-src 'none'" in text
     assert not re.search(r"https?://|@import|\bfetch\(|XMLHttpRequest|WebSocket|<link(?![^>]*data:)|\bsrc=", text)
@@ -136,7 +137,7 @@ def test_the_page_asks_for_nothing_and_shows_names_as_they_are(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_flights_of_32_agents_and_1000_steps_take_less_than_a_megabyte(tmp_path):
+def test_two_rollouts_of_32_agents_and_1000_steps_take_less_than_a_megabyte(tmp_path):
     env_config, names = FlockingConfig(), ("expert", "LocalReynolds(hops=1)")
     policies = reference_policies(env_config)
     rollouts = {name: record(policies[name], env_config, num_agents=32, steps=1000, seed=5) for name in names}
@@ -144,7 +145,7 @@ def test_two_flights_of_32_agents_and_1000_steps_take_less_than_a_megabyte(tmp_p
     assert (tmp_path / "replay.html").stat().st_size < 1_000_000
 
 
-def test_what_cannot_be_done_is_said_in_one_sentence(tmp_path):
+def test_invalid_settings_are_one_sentence(tmp_path):
     (tmp_path / "config.yaml").write_text("schema_version: 1\n")
     run = str(tmp_path)
     for config, words in (
@@ -161,20 +162,20 @@ def test_what_cannot_be_done_is_said_in_one_sentence(tmp_path):
         assert "\n" not in str(error.value)
 
 
-def test_a_picture_is_the_same_each_time(tmp_path):
+def test_equal_recordings_give_equal_images(tmp_path):
     pytest.importorskip("matplotlib")
-    from modgnn_rl.visualization.picture import write_picture
+    from modgnn_rl.visualization.image import write_image
 
-    recording, _ = _record(FAULTY, steps=4)
+    recording, _ = _record(PERTURBED, steps=4)
     for name in ("a.svg", "b.svg"):
-        write_picture(tmp_path / name, {"expert": recording}, 3)
+        write_image(tmp_path / name, {"expert": recording}, 3)
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     assert b"expert" in (tmp_path / "a.svg").read_bytes()
 
 
 # ---- in a browser
 
-PICTURE = "(() => { const c = panes[0].canvas; return c.toDataURL(); })()"
+IMAGE = "(() => { const c = panes[0].canvas; return c.toDataURL(); })()"
 COLOURS = """(() => {
   const c = panes[0].canvas, d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data, s = new Set();
   for (let i = 0; i < d.length; i += 4) s.add(d[i] << 16 | d[i + 1] << 8 | d[i + 2]);
@@ -225,7 +226,7 @@ def test_the_page_plays_and_holds_what_was_recorded(page, dark):
         window.wait("!state.playing")  # at its end it stops
         assert "step 59 / 59" in window.run("document.getElementById('clock').textContent")
         assert window.run(COLOURS) > 50
-        recording, seen = _record(FAULTY, steps=60)
+        recording, seen = _record(PERTURBED, steps=60)
         for step in (0, 17, 59):
             window.run(f"goTo({step} * PERIOD)")
             assert window.run("frameNow()") == step
@@ -259,9 +260,9 @@ def test_every_control_acts_by_mouse_and_keyboard(page):
         _changes(window, lambda: window.drag("#panes canvas", (60, 20)), "drag")
         _changes(window, lambda: window.run("byId('speed').value = 4; byId('speed').dispatchEvent(new Event('change'))"
                                             "; goTo(0.3)"), "speed")  # fmt: skip
-        before = window.run(PICTURE)
+        before = window.run(IMAGE)
         window.run("panes[0].select.value = 1; panes[0].select.dispatchEvent(new Event('change'))")
-        window.wait(f"{PICTURE} !== {before!r}")
+        window.wait(f"{IMAGE} !== {before!r}")
         window.key("?")
         assert window.run("byId('help').open")
         _quiet(window)

@@ -12,13 +12,14 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
 from modgnn_rl.errors import one_line
+from modgnn_rl.evaluation.recording import record
 from modgnn_rl.evaluation.rollout import EpisodeMetrics, reference_policies, rollout
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.utils.seeds import derive_seed, seeded
-from modgnn_rl.visualization.video import check_video, film, write_video
+from modgnn_rl.visualization.video import VIDEO_STRIDE, check_video, write_video
 
 __all__ = ["DashboardCallback", "log_evaluation"]
 
@@ -151,17 +152,19 @@ class DashboardCallback(Callback):
         """Film the first policy with the first size; always the same rollout, so that films can be compared."""
         env_config, folder = self.config.env, self.run.path / "videos"
         size = env_config.sizes[0]
-        frames = film(
+        recording = record(
             next(iter(self.policies.values())),
             env_config,
             num_agents=size,
             steps=self._steps,
             seed=derive_seed(self.config.seed, "references", size),
+            stride=VIDEO_STRIDE,
             device=self.config.device,
+            expert=self.expert,
         )
         folder.mkdir(exist_ok=True)
         path = folder / f"round_{self.last:05d}.mp4"
-        write_video(path, frames, env_config.control_frequency)
+        write_video(path, recording)
         self.filmed = self.last
         self.loggers.log_video(self.last, f"{size}/rollout", path)
 

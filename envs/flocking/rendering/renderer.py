@@ -1,9 +1,8 @@
-"""Pictures of a flock: agents, the leader in red, target velocities as blue arrows, communication links in yellow.
+"""Images of a flock: agents, the leader in red, target velocities as blue arrows, communication edges in yellow.
 
-A picture is a function of the state alone, so that it is the same whichever engine moves the flock. PyBullet draws
-the solid parts with its software renderer or in its window. The software renderer knows no lines, and neither edges
-that are smooth nor colours that let others through: it draws at twice the size, and the links are laid over its image,
-hidden by what lies nearer.
+An image depends on the state alone, not on the physics engine. PyBullet draws the solid parts with its software
+renderer or in its window. The software renderer has no lines, antialiasing or transparency, so it draws at twice the
+size, and edges are drawn over its image where the depth buffer has nothing nearer.
 """
 
 from __future__ import annotations
@@ -18,50 +17,44 @@ from numpy.typing import NDArray
 
 from modgnn_rl.envs.flocking.rendering.meshes import ARROW, QUADCOPTER, normals, quaternions_along
 from modgnn_rl.errors import InputError
+from modgnn_rl.visualization.recording import Frame, shortest_edges
 
-__all__ = ["RENDER_MODES", "Flock", "Renderer", "check_render_mode", "has_display"]
+__all__ = ["RENDER_MODES", "Renderer", "check_render_mode", "has_display"]
 
 Array = NDArray[Any]
 
 RENDER_MODES = ("human", "rgb_array")
-ARROW_TIME = 1.0  # s; an arrow is as long as the way flown in this time
-ARM = (0.11, 0.025)  # m, and share of the view: arms of agents, drawn longer than they are so that one sees them
+ARROW_TIME = 1.0  # s; the length of an arrow is the distance covered in this time
+ARM = (0.11, 0.025)  # m, and fraction of the view: drawn length of agents' arms, exaggerated so that they are visible
 LEADER_SCALE = 1.3
-MAX_LINKS = 10_000  # the shortest are drawn
+MAX_EDGES = 10_000  # the shortest are drawn
 VIEW = np.array([-0.45, -0.85, 0.38])  # from the flock to the camera
-FIELD_OF_VIEW = 30.0  # of the height, degrees
-SMALLEST_VIEW = 1.0  # m from the centre to the edge
+FIELD_OF_VIEW = 30.0  # vertical, degrees
+MIN_VIEW = 1.0  # m from the centre to the border
 OVERSAMPLING = 2
-BACKGROUND = np.array([[251, 252, 254], [229, 234, 241]])  # at the top and at the bottom
+LEVEL = (0.0, 0.0, 0.0, 1.0)  # quaternion
+BACKGROUND = np.array([[251, 252, 254], [229, 234, 241]])  # top and bottom
 WINDOW_BACKGROUND = " ".join(f"--background_color_{name}=0.95" for name in ("red", "green", "blue"))
-HAZE = 0.4  # share of the background in what is farthest away
+HAZE = 0.4  # fraction of the background in the colour of the farthest parts
 MESHES = {
     "follower": (QUADCOPTER, (0.12, 0.15, 0.22)),
     "leader": (LEADER_SCALE * QUADCOPTER, (0.86, 0.08, 0.10)),
     "arrow": (ARROW, (0.10, 0.38, 0.90)),
 }
-LINK_COLOUR = (0.96, 0.74, 0.05)
-LINK_OPACITY = 0.5
+EDGE_COLOUR = (0.96, 0.74, 0.05)
+EDGE_OPACITY = 0.5
 
 
-class Flock(NamedTuple):
-    """What is drawn of a flock of N agents, the leader first.
-
-    Attributes:
-        position: m [N, 3].
-        quaternion: attitudes x, y, z, w [N, 4].
-        target_velocity: m/s [N, 3].
-        adjacency: bool [N, N].
-    """
+class _Agents(NamedTuple):
+    """The agents of a frame that are drawn: positions [N, 3], quaternions [N, 4], target velocities [N, 3]."""
 
     position: Array
     quaternion: Array
     target_velocity: Array
-    adjacency: Array
 
 
-class Look(NamedTuple):
-    """What a body looks like: a mesh of `MESHES`, its width and its length along its z axis, m."""
+class Shape(NamedTuple):
+    """Appearance of a body: a mesh of `MESHES`, its width and its length along its z axis, m."""
 
     mesh: str
     width: float
@@ -69,7 +62,7 @@ class Look(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """Where a picture is taken from: PyBullet's view and projection matrices, as it returns them."""
+    """Viewpoint of an image: PyBullet's view and projection matrices, in its format."""
 
     target: Array
     distance: float
@@ -77,7 +70,7 @@ class Camera(NamedTuple):
     projection: tuple[float, ...]
 
     def project(self, points: Array, width: int, height: int) -> Array:
-        """Points [P, 3] in the picture: column, row, and depth as in PyBullet's depth buffer [P, 3]."""
+        """Project points [P, 3] to column, row, and depth as in PyBullet's depth buffer [P, 3]."""
         view, projection = (np.reshape(matrix, (4, 4)).T for matrix in (self.view, self.projection))
         clip = np.append(points, np.ones((len(points), 1)), -1) @ (projection @ view).T
         x, y, depth = (clip[:, :3] / clip[:, 3:]).T
@@ -85,32 +78,30 @@ class Camera(NamedTuple):
 
 
 class Renderer:
-    """Draws flocks into arrays or into a window, in a PyBullet client of its own.
+    """Draws flocks into arrays or into a window, with its own PyBullet client.
 
     Args:
         render_mode: ``"rgb_array"`` draws without a display, ``"human"`` in PyBullet's window.
-        width: width of the picture, pixels.
-        height: its height.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
 
     Raises:
-        InputError: on another mode or size, or where there is no display for a window.
+        InputError: another mode or size is given, or there is no display for a window.
     """
 
     def __init__(self, render_mode: str = "rgb_array", width: int = 960, height: int = 720) -> None:
         check_render_mode(render_mode)
         for name, size in (("width", width), ("height", height)):
             if not isinstance(size, int) or not 16 <= size <= 4096:
-                raise InputError(f"{name}={size!r} of the picture is not a whole number from 16 to 4096")
-        from modgnn_rl.envs.flocking.physics.bullet import (
-            import_pybullet,  # here, since PyBullet takes a moment to load
-        )
+                raise InputError(f"{name}={size!r} of the image is not an integer from 16 to 4096")
+        from modgnn_rl.envs.flocking.physics.bullet import import_pybullet  # here, because it is slow to load
 
         pybullet = import_pybullet()
         self.bullet = pybullet
         self.render_mode, self.width, self.height = render_mode, width, height
-        # PyBullet never gives back the memory of a shape: each is made once, and bodies that stay the same are moved.
-        self.shapes: dict[Look, int] = {}
-        self.shown: dict[tuple[str, int], tuple[Look, int]] = {}
+        # PyBullet never frees the memory of a shape, so each is created once, and bodies of the same shape are moved.
+        self.shapes: dict[Shape, int] = {}
+        self.bodies: dict[tuple[str, int], tuple[Shape, int]] = {}
         self.lines: list[int] = []
         if render_mode == "rgb_array":
             self.client = pybullet.connect(pybullet.DIRECT)
@@ -123,35 +114,37 @@ class Renderer:
         pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=self.client)
         pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_SHADOWS, 0, physicsClientId=self.client)
 
-    def draw(self, flock: Flock) -> Array | None:
-        """Draw a flock; agents whose position is not finite are left out.
+    def draw(self, frame: Frame) -> Array | None:
+        """Draw a flock; agents with a position that is NaN or infinite are left out.
 
         Returns:
-            the picture, uint8 [H, W, 3]; None in a window.
+            the image, uint8 [H, W, 3]; None for a window.
 
         Raises:
-            InputError: when the window has been closed.
+            InputError: the window has been closed.
         """
         if not self.bullet.isConnected(self.client):
-            raise InputError("there is nothing to draw in: the window or the environment has been closed")
-        there = np.isfinite(flock.position).all(-1)
-        position, quaternion, target = (np.asarray(part, np.float64)[there] for part in flock[:3])
-        flock = Flock(position, quaternion, target, flock.adjacency[there][:, there])
-        camera = self._camera(flock)
-        links = flock.position[_links(flock)]
+            raise InputError("cannot draw: the window or the environment has been closed")
+        edges = np.asarray(frame.position, np.float64)[shortest_edges(frame, MAX_EDGES)]
+        drawn = np.isfinite(frame.position).all(-1)
+        quaternion = np.tile(LEVEL, (len(drawn), 1)) if frame.quaternion is None else frame.quaternion
+        agents = _Agents(
+            *(np.asarray(part, np.float64)[drawn] for part in (frame.position, quaternion, frame.target_velocity))
+        )
+        camera = self._camera(agents)
         if self.render_mode == "human":
-            self._show(flock, camera, links)
+            self._show(agents, camera, edges)
             return None
-        return self._picture(flock, camera, links)
+        return self._image(agents, camera, edges)
 
     def close(self) -> None:
         """Close the window and end the client."""
         if self.bullet.isConnected(self.client):
             self.bullet.disconnect(self.client)
 
-    def _camera(self, flock: Flock) -> Camera:
-        """The camera that holds all agents and arrows in view."""
-        points = np.concatenate((flock.position, flock.position + ARROW_TIME * flock.target_velocity))
+    def _camera(self, agents: _Agents) -> Camera:
+        """A camera with all agents and arrows in view."""
+        points = np.concatenate((agents.position, agents.position + ARROW_TIME * agents.target_velocity))
         points = points if len(points) else np.zeros((1, 3))
         back = VIEW / np.linalg.norm(VIEW)
         right = np.cross((0, 0, 1), back)
@@ -161,7 +154,7 @@ class Renderer:
         slope = np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array((self.width / self.height, 1.0))
         offset = seen - centre
         fitting = (np.abs(offset[:, :2]) + ARM[0]) / slope + offset[:, 2:]
-        distance = 1.05 * max(fitting.max(), SMALLEST_VIEW / slope[1])
+        distance = 1.05 * max(fitting.max(), MIN_VIEW / slope[1])
         depth = np.abs(offset[:, 2]).max() + 1.0
         target = centre @ axes
         view = self.bullet.computeViewMatrix(target + distance * back, target, (0, 0, 1))
@@ -169,39 +162,40 @@ class Renderer:
         aspect = self.width / self.height
         return Camera(target, distance, view, self.bullet.computeProjectionMatrixFOV(FIELD_OF_VIEW, aspect, near, far))
 
-    def _solids(self, flock: Flock, camera: Camera) -> None:
-        """Put agents and arrows into the world, and take out those that are not there any more."""
+    def _place_bodies(self, agents: _Agents, camera: Camera) -> None:
+        """Create or move the bodies of agents and arrows, and remove those no longer needed."""
         arm = round(max(ARM[0], ARM[1] * camera.distance * np.tan(np.radians(FIELD_OF_VIEW / 2))), 2)
-        lengths = (ARROW_TIME * np.linalg.norm(flock.target_velocity, axis=-1)).round(2).tolist()
-        directions = quaternions_along(flock.target_velocity)
-        gone = set(self.shown)
+        lengths = (ARROW_TIME * np.linalg.norm(agents.target_velocity, axis=-1)).round(2).tolist()
+        directions = quaternions_along(agents.target_velocity)
+        unused = set(self.bodies)
         for index, length in enumerate(lengths):
-            parts = [("agent", Look("follower" if index else "leader", arm, arm), flock.quaternion[index])]
+            parts = [("agent", Shape("follower" if index else "leader", arm, arm), agents.quaternion[index])]
             if length:
-                parts.append(("arrow", Look("arrow", round(0.18 * arm, 3), length), directions[index]))
-            for name, look, quaternion in parts:
-                self._put((name, index), look, flock.position[index], quaternion)
-                gone.discard((name, index))
-        for place in gone:
-            self.bullet.removeBody(self.shown.pop(place)[1], physicsClientId=self.client)
+                parts.append(("arrow", Shape("arrow", round(0.18 * arm, 3), length), directions[index]))
+            for name, shape, quaternion in parts:
+                self._place((name, index), shape, agents.position[index], quaternion)
+                unused.discard((name, index))
+        for key in unused:
+            self.bullet.removeBody(self.bodies.pop(key)[1], physicsClientId=self.client)
 
-    def _put(self, place: tuple[str, int], look: Look, position: Array, quaternion: Array) -> None:
-        """Show one body: the one that was in its place, if that looks as it should, or a new one."""
+    def _place(self, key: tuple[str, int], shape: Shape, position: Array, quaternion: Array) -> None:
+        """Move the body with this key if it has this shape, else replace it by a new one."""
         bullet, client = self.bullet, self.client
-        old, body = self.shown.get(place, (None, -1))
-        if old == look:
+        old, body = self.bodies.get(key, (None, -1))
+        if old == shape:
             bullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
             return
         if old is not None:
             bullet.removeBody(body, physicsClientId=client)
-        body = bullet.createMultiBody(0, -1, self._shape(look), position, quaternion, physicsClientId=client)
-        self.shown[place] = (look, body)
+        body = bullet.createMultiBody(0, -1, self._visual_shape(shape), position, quaternion, physicsClientId=client)
+        self.bodies[key] = (shape, body)
 
-    def _shape(self, look: Look) -> int:
-        if look not in self.shapes:
-            mesh, colour = MESHES[look.mesh]
-            mesh = mesh * (look.width, look.width, look.length)
-            self.shapes[look] = self.bullet.createVisualShape(
+    def _visual_shape(self, shape: Shape) -> int:
+        """PyBullet's index of a shape."""
+        if shape not in self.shapes:
+            mesh, colour = MESHES[shape.mesh]
+            mesh = mesh * (shape.width, shape.width, shape.length)
+            self.shapes[shape] = self.bullet.createVisualShape(
                 self.bullet.GEOM_MESH,
                 vertices=mesh.reshape(-1, 3).tolist(),
                 indices=list(range(3 * len(mesh))),
@@ -209,12 +203,12 @@ class Renderer:
                 rgbaColor=(*colour, 1.0),
                 physicsClientId=self.client,
             )
-        return self.shapes[look]
+        return self.shapes[shape]
 
-    def _picture(self, flock: Flock, camera: Camera, links: Array) -> Array:
-        """The picture, uint8 [H, W, 3]."""
+    def _image(self, agents: _Agents, camera: Camera, edges: Array) -> Array:
+        """The image, uint8 [H, W, 3]."""
         bullet, width, height = self.bullet, OVERSAMPLING * self.width, OVERSAMPLING * self.height
-        self._solids(flock, camera)
+        self._place_bodies(agents, camera)
         _, _, colours, depth, bodies = bullet.getCameraImage(
             width,
             height,
@@ -231,29 +225,29 @@ class Renderer:
         fine = np.linspace(BACKGROUND[0], BACKGROUND[1], height).astype(np.float32)[:, None].repeat(width, 1)
         depth = np.reshape(depth, (height, width))
         solid = np.reshape(bodies, (height, width)) >= 0
-        fine[solid] += (np.reshape(colours, (height, width, 4))[solid][:, :3] - fine[solid]) * _clearness(depth[solid])
-        _overlay(fine, depth, camera.project(links.reshape(-1, 3), width, height).reshape(-1, 2, 3))
+        fine[solid] += (np.reshape(colours, (height, width, 4))[solid][:, :3] - fine[solid]) * _opacity(depth[solid])
+        _overlay(fine, depth, camera.project(edges.reshape(-1, 3), width, height).reshape(-1, 2, 3))
         offsets = range(OVERSAMPLING)
         parts = [fine[row::OVERSAMPLING, column::OVERSAMPLING] for row in offsets for column in offsets]
         image: Array = sum(parts[1:], parts[0]) / len(parts)
         return image.round().astype(np.uint8)
 
-    def _show(self, flock: Flock, camera: Camera, links: Array) -> None:
-        """Draw in the window; links are lines there."""
+    def _show(self, agents: _Agents, camera: Camera, edges: Array) -> None:
+        """Draw in the window, edges as debug lines."""
         bullet, client = self.bullet, self.client
         bullet.configureDebugVisualizer(bullet.COV_ENABLE_RENDERING, 0, physicsClientId=client)
-        is_new = not self.shown
-        self._solids(flock, camera)
+        is_new = not self.bodies
+        self._place_bodies(agents, camera)
         old, self.lines = self.lines, []
-        for index, (begin, end) in enumerate(links.tolist()):
+        for index, (begin, end) in enumerate(edges.tolist()):
             replaced = old[index] if index < len(old) else -1
             line = bullet.addUserDebugLine(
-                begin, end, LINK_COLOUR, replaceItemUniqueId=replaced, physicsClientId=client
+                begin, end, EDGE_COLOUR, replaceItemUniqueId=replaced, physicsClientId=client
             )
             self.lines.append(line)
-        for line in old[len(links) :]:
+        for line in old[len(edges) :]:
             bullet.removeUserDebugItem(line, physicsClientId=client)
-        # The window follows the flock; from where and how far away is for the user's mouse to say.
+        # The window follows the flock; direction and distance are set with the mouse.
         yaw, pitch, distance = bullet.getDebugVisualizerCamera(physicsClientId=client)[8:11]
         if is_new:
             yaw = np.degrees(np.arctan2(VIEW[1], VIEW[0])) + 90
@@ -269,7 +263,7 @@ def has_display() -> bool:
         return True
     if not os.environ.get("DISPLAY"):
         return False
-    try:  # PyBullet would end the process
+    try:  # without this check, PyBullet would end the process
         x11 = ctypes.CDLL("libX11.so.6")
     except OSError:
         return False
@@ -281,10 +275,10 @@ def has_display() -> bool:
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Refuse what cannot be drawn.
+    """Check that images can be drawn in this mode.
 
     Raises:
-        InputError: on a mode that there is not, or on a window where there is no display.
+        InputError: the mode does not exist, or there is no display for a window.
     """
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise InputError(f"render_mode={render_mode!r} is not one of {', '.join(RENDER_MODES)}")
@@ -292,17 +286,8 @@ def check_render_mode(render_mode: str | None) -> None:
         raise InputError('render_mode="human" needs a display and there is none; use render_mode="rgb_array"')
 
 
-def _links(flock: Flock) -> Array:
-    """Pairs of agents with a link in either direction, the shortest `MAX_LINKS` of them [L, 2]."""
-    pairs = np.argwhere(np.triu(flock.adjacency | flock.adjacency.T, 1))
-    if len(pairs) > MAX_LINKS:
-        length = np.linalg.norm(flock.position[pairs[:, 0]] - flock.position[pairs[:, 1]], axis=-1)
-        pairs = pairs[np.argpartition(length, MAX_LINKS)[:MAX_LINKS]]
-    return pairs
-
-
-def _clearness(depth: Array) -> Array:
-    """How much of the background does not shine through, by depth [P] -> [P, 1]: the nearest is the clearest."""
+def _opacity(depth: Array) -> Array:
+    """Opacity of solid parts in front of the background, by depth [P] -> [P, 1]; the nearest are opaque."""
     if not len(depth):
         return depth[:, None]
     nearest, farthest = depth.min(), depth.max()
@@ -310,19 +295,19 @@ def _clearness(depth: Array) -> Array:
 
 
 def _overlay(image: Array, depth: Array, lines: Array) -> None:
-    """Lay lines over an image [H, W, 3], where nothing of the depth buffer [H, W] is nearer.
+    """Draw lines over an image [H, W, 3] where nothing in the depth buffer [H, W] is nearer.
 
     Args:
-        image: is changed.
-        depth: as PyBullet gives it.
+        image: changed in place.
+        depth: in PyBullet's format.
         lines: column, row and depth of both ends [L, 2, 3].
     """
     if not len(lines):
         return
     height, width = depth.shape
     longest = int(np.abs(lines[:, 1, :2] - lines[:, 0, :2]).max()) + 2
-    share = np.linspace(0, 1, min(longest, 2 * (height + width)))[:, None, None]
-    points = ((1 - share) * lines[:, 0] + share * lines[:, 1]).reshape(-1, 3)
+    t = np.linspace(0, 1, min(longest, 2 * (height + width)))[:, None, None]
+    points = ((1 - t) * lines[:, 0] + t * lines[:, 1]).reshape(-1, 3)
     column, row = points[:, :2].astype(int).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row, near = column[inside], row[inside], points[inside, 2]
@@ -330,4 +315,4 @@ def _overlay(image: Array, depth: Array, lines: Array) -> None:
     covered = np.zeros(depth.shape, bool)
     covered[row[seen], column[seen]] = True
     covered[1:] |= covered[:-1]  # two fine pixels thick
-    image[covered] += (255 * np.array(LINK_COLOUR, np.float32) - image[covered]) * LINK_OPACITY
+    image[covered] += (255 * np.array(EDGE_COLOUR, np.float32) - image[covered]) * EDGE_OPACITY

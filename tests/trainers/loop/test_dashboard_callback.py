@@ -212,7 +212,7 @@ def test_what_fails_is_left_out_with_one_warning(watch, monkeypatch):
             watch.on_round(index, {"4/error": 0.5})
 
     watch.config.video_rounds = 2
-    monkeypatch.setattr(dashboard_callback, "film", fail)
+    monkeypatch.setattr(dashboard_callback, "record", fail)
     with pytest.warns(RuntimeWarning) as caught:
         go_on()
     assert [str(warning.message) for warning in caught] == [

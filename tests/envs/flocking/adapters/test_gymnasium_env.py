@@ -179,12 +179,12 @@ def test_a_follower_flies_at_its_own_action() -> None:
     env = parallel_env(num_agents=3)
     env.reset(seed=0)
     env.step({"agent_2": np.array([0.5, 0.0, 0.0])})
-    target = env._flocks.env.target_velocity[0]
+    target = env.flocks.env.target_velocity[0]
     assert target[1:].tolist() == [[0, 0, 0], [0.5, 0, 0]]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"), [({"num_agents": 1}, "leaves nobody"), ({"graph": "links"}, "matrix")]
+    ("arguments", "message"), [({"num_agents": 1}, "leaves no agent to control"), ({"graph": "links"}, "matrix")]
 )
 def test_flocks_without_followers_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
