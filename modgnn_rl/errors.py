@@ -1,4 +1,4 @@
-"""The exceptions that the user can do something about."""
+"""Errors that the user can fix, and how they are worded."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ class InputError(ValueError):
 
 
 class NotFinite(InputError):
-    """Numbers that have become NaN or infinite while flying or training: a state, an action, a loss, a gradient.
+    """A state, an action, a loss or a gradient became NaN or infinite.
 
-    Its message says whose they are and when, what was found, and which setting helps. No bug, hence an `InputError`.
+    Its message says which agent and step, what was found, and which setting helps.
     """
 
 
 def one_line(error: BaseException) -> str:
-    """The first line of what an exception says, or its kind where it says nothing."""
+    """The first line of what an exception says, or its type if it has no message."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
-    """Return ``"; did you mean 'x'?"`` for the known word nearest to ``word``, or an empty string."""
+    """Return ``"; did you mean 'x'?"`` for the known word most similar to ``word``, or an empty string."""
     near = difflib.get_close_matches(word, list(known), n=1)
     return f"; did you mean '{near[0]}'?" if near else ""

@@ -136,8 +136,8 @@ def test_exported_names_resolve_and_are_not_those_of_submodules(package: str) ->
     for name in module.__all__:
         assert getattr(module, name) is not None
     stub = ast.parse((Path(module.__path__[0]) / "__init__.pyi").read_text())
-    for node in stub.body:
-        for alias in node.names if isinstance(node, ast.ImportFrom) else []:
+    for node in [node for node in stub.body if isinstance(node, ast.ImportFrom)]:
+        for alias in node.names:
             assert alias.asname == alias.name  # so that type checkers take it as exported
             home = importlib.import_module(f"{package}.{node.module}")
             assert getattr(module, alias.name) is getattr(home, alias.name)

@@ -15,15 +15,15 @@ _modgnn_rl() {
         fi
     fi
     case $word in
-        [\"\']*) word=${word:1} ;;  # bash completes what stands behind the quote
+        [\"\']*) word=${word:1} ;;  # bash completes what follows the quote
         *)
-            # Elsewhere it completes what stands behind the last character at which words break.
+            # Elsewhere it completes what follows the last character at which words break.
             [[ $COMP_WORDBREAKS == *=* && $word == *=* ]] && before=${word%"${word##*=}"}
             ;;
     esac
     COMPREPLY=($(compgen -W "$choices" -- "$word"))
     COMPREPLY=("${COMPREPLY[@]#"$before"}")
-    # Nothing found: bash completes files, as in run=runs/... A name of a setting or group is to be gone on with.
+    # Nothing found: bash completes files, as in run=runs/... No space after a setting or group, which needs a value.
     if [[ ${#COMPREPLY[@]} -eq 1 && ${COMPREPLY[0]} == *[=./] ]]; then
         compopt -o nospace 2>/dev/null
     fi

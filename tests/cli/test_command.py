@@ -107,7 +107,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
         configs: list[Toy] = []
 
         def remember(config: Toy) -> None:
-            """Fly a toy flock.
+            """Train a toy flock.
 
             A second paragraph.
             """
@@ -181,7 +181,7 @@ def test_settings_reach_main_as_the_dataclass(run: Run, arguments: list[str], ex
         (["--multirun", "trainer=bc,dager"], ["trainer=dager", "'dagger'"]),
     ],
 )
-def test_an_error_of_the_user_is_one_line(run: Run, arguments: list[str], words: list[str]) -> None:
+def test_a_user_error_is_one_line(run: Run, arguments: list[str], words: list[str]) -> None:
     outcome = run(*arguments)
     assert outcome.code == 2
     assert outcome.configs == []
@@ -216,7 +216,7 @@ def test_ctrl_c_is_one_line(run: Run) -> None:
     assert run(main=main)[:3] == (130, "", "interrupted\n")
 
 
-def test_a_signal_heeded_is_the_exit_code(run: Run) -> None:
+def test_the_exit_code_names_the_signal(run: Run) -> None:
     def main(config: Toy) -> None:
         raise Stopped(signal.SIGTERM)
 
@@ -244,7 +244,7 @@ def test_a_job_that_fails_does_not_stop_the_others(run: Run) -> None:
     assert summary == "2 of 4 jobs failed: seed=1; seed=2"
 
 
-def test_settings_given_are_those_of_the_command_line(run: Run) -> None:
+def test_settings_given_are_those_on_the_command_line(run: Run) -> None:
     given = []
     run("seed=3", "trainer=dagger", "env.comm_range=2", main=lambda config: given.append(settings_given(config)))
     assert given == [{"seed": 3, "trainer": Dagger(), "env.comm_range": 2}]
@@ -308,7 +308,7 @@ def test_help_lists_choices_and_settings_with_doc_default_and_range(run: Run) ->
     lines = [" ".join(line.split()) for line in outcome.out.splitlines()]
     assert (outcome.code, outcome.err) == (0, "")
     for line in [
-        "Fly a toy flock.",
+        "Train a toy flock.",
         "env=flocking, paper*",
         "trainer=bc, dagger*, patient",
         "seed=0 random seed, $5 or ${more} [at least 0]",
@@ -345,7 +345,7 @@ def test_help_is_as_wide_as_the_terminal_and_has_a_section_for_each_node(
 
 def test_help_shows_the_examples_of_the_docstring(run: Run) -> None:
     def main(config: Toy) -> None:
-        """Fly a toy flock.
+        """Train a toy flock.
 
         Examples::
 
@@ -353,17 +353,17 @@ def test_help_shows_the_examples_of_the_docstring(run: Run) -> None:
         """
 
     lines = run("--help", main=main).out.splitlines()
-    assert lines[2:7] == ["Fly a toy flock.", "", "Examples:", "    python -m toy seed=1", ""]
+    assert lines[2:7] == ["Train a toy flock.", "", "Examples:", "    python -m toy seed=1", ""]
 
 
-def test_tab_offers_nothing_of_hydra_itself(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tab_offers_the_settings_of_the_command_only(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COMP_LINE", "toy ")
     assert set(run("--shell-completion", "query=bash").out.split()) == {
         *("seed=", "source=", "env=", "env.", "trainer=", "trainer."),
     }
 
 
-def test_the_script_for_a_shell_is_ours(run: Run) -> None:
+def test_hydras_install_prints_our_completion_script(run: Run) -> None:
     assert run("-sc", "install=bash").out == f"{completion_script('bash')}\n"
     outcome = run("-sc", "install=tcsh")
     assert (outcome.code, outcome.out) == (2, "")

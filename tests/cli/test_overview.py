@@ -21,7 +21,7 @@ NAMES = {path.stem for path in (ROOT / "configs").glob("*.yaml")}  # each comman
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
 
 
-def test_it_lists_every_command_without_importing_any():
+def test_the_overview_lists_every_command_without_importing_any():
     code = "import sys; from modgnn_rl.__main__ import main; main([]); print({'torch', 'hydra'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
     assert (done.stderr, done.stdout.splitlines()[-1]) == ("", "set()")
@@ -30,7 +30,7 @@ def test_it_lists_every_command_without_importing_any():
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))
-def test_a_command_is_told_by_its_docstring_and_has_examples(name):
+def test_a_command_has_a_summary_and_examples(name):
     module = __import__(f"modgnn_rl.{name}", fromlist=["main"])
     assert commands()[name] == module.main.__doc__.partition("\n\n")[0]
     assert commands()[name] in " ".join(overview().split())
@@ -40,7 +40,7 @@ def test_a_command_is_told_by_its_docstring_and_has_examples(name):
 
 
 @pytest.mark.parametrize("width", [60, 80, 200])
-def test_it_is_as_wide_as_the_terminal(monkeypatch, width):
+def test_the_overview_is_as_wide_as_the_terminal(monkeypatch, width):
     monkeypatch.setenv("COLUMNS", str(width))
     lines = [line for line in overview().splitlines() if "python -m" not in line]  # to be pasted
     assert max(map(len, lines)) <= max(width, 80)
@@ -60,7 +60,7 @@ def test_it_is_as_wide_as_the_terminal(monkeypatch, width):
         ),
     ],
 )
-def test_what_it_answers(capsys, arguments, code, out, err):
+def test_answers_and_exit_codes(capsys, arguments, code, out, err):
     assert main(arguments) == code
     captured = capsys.readouterr()
     assert captured.out == out
@@ -99,7 +99,7 @@ def test_tab_in_bash(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
-def test_a_reader_that_has_left_is_no_error():
+def test_a_closed_pipe_is_not_an_error():
     python = f"{shlex.quote(sys.executable)} -m modgnn_rl.train"
     first = f"{python} {FIRST['train']} --cfg job"  # can be composed
     script = f"{python} --help | true; echo ${{PIPESTATUS[0]}}; {first} | true; echo ${{PIPESTATUS[0]}}"
@@ -108,7 +108,7 @@ def test_a_reader_that_has_left_is_no_error():
 
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_other_shells_can_read_their_script(shell):
+def test_other_shells_can_parse_their_script(shell):
     if shutil.which(shell) is None:
         pytest.skip(f"no {shell}")
     done = subprocess.run([shell, "-n"], input=completion_script(shell), capture_output=True, text=True, timeout=60)

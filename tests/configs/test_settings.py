@@ -1,4 +1,4 @@
-"""Settings and the sentences that refuse bad ones."""
+"""Settings, and the error messages for bad ones."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_list_default_is_not_shared():
     assert second.rates == [1.0, 2.0]
 
 
-def test_a_suggestion_needs_a_likeness():
+def test_only_a_similar_word_is_suggested():
     assert suggestion("comm_rnge", ["comm_range", "seed"]) == "; did you mean 'comm_range'?"
     assert suggestion("xyz", ["comm_range", "seed"]) == ""
 
