@@ -67,8 +67,9 @@ def watched() -> Clock:
     from modgnn_rl.trainers.collectors.local import FlockCollector
     from modgnn_rl.trainers.common.optimization import GuardedOptimizer
     from modgnn_rl.trainers.imitation import learner
+    from modgnn_rl.trainers.loop.checkpointer import BestPolicies, Checkpointer
     from modgnn_rl.trainers.loop.dashboard_callback import DashboardCallback
-    from modgnn_rl.trainers.loop.training_loop import TrainingLoop
+    from modgnn_rl.trainers.loop.metrics_writer import MetricsWriter
 
     clock = Clock()
     clock.watch(FlockingEnv, "_step", "environment: physics and graph")
@@ -83,12 +84,12 @@ def watched() -> Clock:
     clock.watch(torch.Tensor, "backward", "backward")
     clock.watch(GuardedOptimizer, "step", "optimiser and moving average")
     clock.watch(AveragedModel, "update_parameters", "optimiser and moving average")
-    clock.watch(TrainingLoop, "_record", "logging")
+    clock.watch(MetricsWriter, "write", "logging")
     clock.watch(DashboardCallback, "on_round", "logging")
     clock.watch(DashboardCallback, "on_collect", "logging")
     clock.watch(DashboardCallback, "on_start", "logging: reference rollouts, once")
-    clock.watch(TrainingLoop, "_save", "checkpoints")
-    clock.watch(TrainingLoop, "_save_best", "checkpoints")
+    clock.watch(Checkpointer, "save", "checkpoints")
+    clock.watch(BestPolicies, "save", "checkpoints")
     return clock
 
 

@@ -70,7 +70,7 @@ def main(
         total_frames=num_envs * steps * rounds,
         auto_register_policy_transforms=True,  # makes the messages recurrent state of the environment
     )
-    # TorchRL's MAPPOLoss; it also pulls towards actions under ("agents", "anchor"), where the data have them.
+    # TorchRL's MAPPOLoss; it also penalises the divergence from ("agents", "reference_action") if the data have it.
     loss_module = KLPenaltyMAPPOLoss(actor, critic, functional=False, normalize_advantage=True)
     loss_module.set_keys(
         action=("agents", "action"),

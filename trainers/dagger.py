@@ -1,4 +1,4 @@
-"""DAgger (Ross, Gordon and Bagnell 2011): learn at the states that the policy itself visits."""
+"""DAgger (Ross, Gordon and Bagnell 2011): learn in the states that the policy itself visits."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from modgnn_rl.configs.schema import DAggerConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
 from modgnn_rl.trainers.collectors.behaviour import SafetyGate, beta_schedule, disagreement, ensemble_std
-from modgnn_rl.trainers.collectors.flocks import make_buffers, make_validation_buffers, named_buffers
+from modgnn_rl.trainers.collectors.flocks import make_buffers, make_validation_buffers
 from modgnn_rl.trainers.collectors.windows import window_of
+from modgnn_rl.trainers.imitation.demonstrations import collect_validation
 from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
 from modgnn_rl.trainers.loop.callbacks import StopOnPlateau
 from modgnn_rl.trainers.loop.context import TrainContext
-from modgnn_rl.trainers.loop.metrics import rollout_metrics
+from modgnn_rl.trainers.loop.metrics import mean_over_sizes, rollout_metrics
 from modgnn_rl.trainers.loop.setup import check_steps, check_updates, make_learner
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 
@@ -27,7 +28,7 @@ __all__ = ["dagger"]
 GATES = {"disagreement": disagreement, "ensemble": ensemble_std}
 
 
-def ensemble(config: TrainConfig) -> dict[str, TrainConfig]:
+def ensemble_configs(config: TrainConfig) -> dict[str, TrainConfig]:
     """The settings of each policy that DAgger trains, by name: one, or with ``gate=ensemble`` several."""
     settings: DAggerConfig = config.trainer
     others = range(1, settings.ensemble if settings.gate == "ensemble" else 1)
@@ -41,13 +42,14 @@ def check_dagger(config: TrainConfig, policies: Sequence[ModGNN], expert: Tensor
     check_steps(config, "steps_per_round", window_of(policies, config.trainer))
 
 
-@TRAINERS.register("dagger", settings=DAggerConfig, objective="error", members=ensemble, check=check_dagger)
+@TRAINERS.register("dagger", settings=DAggerConfig, objective="error", members=ensemble_configs, check=check_dagger)
 def dagger(context: TrainContext) -> dict[str, ModGNN]:
     """Train a policy with DAgger.
 
-    The expert flies first and the policy clones it. Then, round by round, mixture and policy go on flying the same
-    flocks, every visited state is labelled with the expert's action and added to all data before, and one optimiser
-    goes on over all of it. What flies, and what is returned, is the moving average of the policy's weights.
+    In round 0 the expert acts and the policy clones it. In every later round the mixture of policy and expert acts, the
+    expert labels all states that are visited, these are added to the data, and the policy is fitted to all data so far.
+    The environments are not reset between rounds, and the optimiser keeps its state. The policy that acts, and that is
+    returned, has the moving average of the weights.
 
     Args:
         context: the run, ``context.config.trainer`` being a `DAggerConfig`.
@@ -55,56 +57,54 @@ def dagger(context: TrainContext) -> dict[str, ModGNN]:
     Returns:
         the trained policy, by the name of its model.
     """
-    config = context.config
-    settings: DAggerConfig = config.trainer
-    sizes = config.env.sizes
-    cloning = settings.cloning_updates // len(sizes)
-    fitting = settings.updates_per_round // len(sizes)
-    updates = (cloning + settings.rounds * fitting) * len(sizes)
-    names = list(ensemble(config))
-    learners = [make_learner(config, (cloning * len(sizes), updates), member) for member in range(len(names))]
-    cloning_stretches = math.ceil(settings.cloning_steps / settings.steps_per_round)
-    gate = None if settings.gate == "none" else SafetyGate(GATES[settings.gate], settings.gate_threshold)
+    config, settings, sizes = context.config, context.config.trainer, context.config.env.sizes
+    cloning_rollouts = math.ceil(settings.cloning_steps / settings.steps_per_round)
+    cloning_updates, updates = settings.cloning_updates // len(sizes), settings.updates_per_round // len(sizes)
+    total = (cloning_updates + settings.rounds * updates) * len(sizes)
+    names = list(ensemble_configs(config))
+    learners = [make_learner(config, (cloning_updates * len(sizes), total), member) for member in range(len(names))]
     policies, expert = [learner.ema_policy for learner in learners], context.expert
-    flown: dict[str, Any] = {"steps": settings.steps_per_round, "hold_steps": settings.hold_steps}
-    flocks = make_buffers(config, policies, expert, **flown, gate=gate)
-    held_out = make_validation_buffers(config, policies, expert, **flown)
-    if settings.plateau_rounds:
-        plateau = StopOnPlateau(settings.plateau_rounds, settings.plateau_gain, after=settings.beta_rounds)
-        context = dataclasses.replace(context, callbacks=[*context.callbacks, plateau])
+    options: dict[str, Any] = {"steps": settings.steps_per_round, "hold_steps": settings.hold_steps}
+    gate = None if settings.gate == "none" else SafetyGate(GATES[settings.gate], settings.gate_threshold)
+    training = make_buffers(config, policies, expert, **options, gate=gate)
+    validation = make_validation_buffers(config, policies, expert, **options)
 
     by_name = dict(zip(names, learners, strict=True))
-    with TrainingLoop(context, by_name, named_buffers(flocks, held_out), updates) as loop:
+    with TrainingLoop(with_early_stopping(context), by_name, training, validation, total=total) as loop:
         for index in loop.rounds(0, settings.rounds):
-            share = 1.0 if index == 0 else beta_of_round(settings, index - 1)
-            stretches, count = (cloning_stretches, cloning) if index == 0 else (1, fitting)
-            metrics = {"learning_rate": learners[0].learning_rate, "beta": share}
-            for size, group in flocks.items():
-                for _ in range(stretches):
-                    rollouts = loop.on_collect(group.fly(share))
-                    group.keep(rollouts)
-                for _ in range(cloning_stretches if not held_out[size].seen else 0):
-                    held_out[size].keep(held_out[size].fly(beta=1.0))
+            repeats, steps = (cloning_rollouts, cloning_updates) if index == 0 else (1, updates)
+            beta = 1.0 if index == 0 else beta_of_round(settings, index)
+            metrics = {"learning_rate": learners[0].learning_rate, "beta": beta}
+            collect_validation(validation, cloning_rollouts)
+            for size, buffer in training.items():
+                for _ in range(repeats):
+                    rollouts = loop.on_collect(buffer.fly(beta))  # the expert labels every state
+                    buffer.keep(rollouts)  # aggregate
                 if index == 0:
-                    group.mixture.restart()
+                    buffer.mixture.restart()
                 metrics |= rollout_metrics(rollouts, config.env)
-                metrics[f"{size}/loss"], *_ = fit_together(learners, group.buffer, count)
-                metrics[f"{size}/validation_loss"], *_ = validate_together(learners, held_out[size].buffer)
-                metrics[f"{size}/states"] = len(group.buffer)
-            metrics["error"] = error = sum(metrics[f"{size}/error"] for size in sizes) / len(sizes)
+                metrics[f"{size}/loss"], *_ = fit_together(learners, buffer.buffer, steps)
+                metrics[f"{size}/validation_loss"], *_ = validate_together(learners, validation[size].buffer)
+                metrics[f"{size}/states"] = len(buffer.buffer)
+            metrics["error"] = error = mean_over_sizes(metrics, "error", sizes)
             metrics["gradient_norm"] = learners[0].gradient_norm
             round_ = f"{index}/{settings.rounds}"
-            loop.log(metrics, count * len(sizes), {names[0]: error}, round=round_, error=error)
+            loop.log(metrics, steps * len(sizes), {names[0]: error}, round=round_, error=error)
 
-    return {names[0]: learners[0].ema_policy}
+    return {names[0]: policies[0]}
 
 
 def beta_of_round(settings: DAggerConfig, index: int) -> float:
-    """The expert's share of the flying time in a round, counted from 0 after the cloning."""
+    """The probability that the expert acts in a round, counted from 1."""
     return beta_schedule(
-        settings.schedule,
-        index,
-        start=settings.beta,
-        decay=settings.beta_decay,
-        last_round=settings.beta_rounds,
+        settings.schedule, index - 1, start=settings.beta, decay=settings.beta_decay, last_round=settings.beta_rounds
     )
+
+
+def with_early_stopping(context: TrainContext) -> TrainContext:
+    """The context with a callback that stops on a plateau of the error, if the settings ask for it."""
+    settings: DAggerConfig = context.config.trainer
+    if settings.plateau_rounds == 0:
+        return context
+    stop = StopOnPlateau(settings.plateau_rounds, settings.plateau_gain, after=settings.beta_rounds)
+    return dataclasses.replace(context, callbacks=[*context.callbacks, stop])

@@ -1,4 +1,4 @@
-"""MAPPO (Yu et al. 2022): improve a policy by reinforcement learning, with a critic that sees the whole flock."""
+"""MAPPO (Yu et al. 2022): reinforcement learning with a critic that sees the whole flock."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from tensordict.nn import TensorDictModuleBase
 from modgnn_rl.configs.schema import MAPPOConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
-from modgnn_rl.trainers.collectors.flocks import flocks_of, named_buffers
+from modgnn_rl.trainers.collectors.flocks import flocks_of
 from modgnn_rl.trainers.collectors.local import make_collector
 from modgnn_rl.trainers.loop.context import TrainContext
-from modgnn_rl.trainers.loop.metrics import reward_metrics, rollout_metrics
+from modgnn_rl.trainers.loop.metrics import mean_over_sizes, reward_metrics, rollout_metrics
 from modgnn_rl.trainers.loop.setup import check_steps, initial_policy
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 from modgnn_rl.trainers.ppo.learner import PPOLearner, ppo_window
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["mappo"]
+__all__ = ["kl_coef_of_round", "mappo"]
 
 
 def check_mappo(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDictModuleBase | None) -> None:
@@ -28,26 +28,23 @@ def check_mappo(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorD
 
 @TRAINERS.register("mappo", settings=MAPPOConfig, objective="reward", check=check_mappo)
 def mappo(context: TrainContext) -> dict[str, ModGNN]:
-    """Improve a policy by MAPPO, from a cloned one (``config.init_from``) or from scratch.
+    """Improve a policy with MAPPO, from a pretrained policy (``config.init_from``) or from scratch.
 
-    Round by round, the policy flies with noise, advantages are estimated, and policy and critic learn from these
-    rollouts alone. The reward knows nothing of the expert; the error against it is measured all the same.
+    In every round the policy acts with noise, advantages are estimated, and policy and critic are updated on these
+    rollouts alone. The reward does not involve the expert; the error against it is only measured.
 
     Args:
-        context: the run, ``context.config.trainer`` being a `MAPPOConfig`; the error is against its expert.
+        context: the run, ``context.config.trainer`` being a `MAPPOConfig`.
 
     Returns:
         the trained policy, the moving average of the weights, by the name of its model.
     """
-    config = context.config
-    settings: MAPPOConfig = config.trainer
-    env_config, sizes = config.env, config.env.sizes
-    learner = PPOLearner(initial_policy(config), settings, env_config.state_key, config.seed)
-    name = config.model.name
-    flocks = {
+    config, settings, sizes = context.config, context.config.trainer, context.config.env.sizes
+    learner = PPOLearner(initial_policy(config), settings, config.env.state_key, config.seed)
+    collectors = {
         size: make_collector(
             config.collector,
-            env_config,
+            config.env,
             flocks_of(size, config),
             size,
             (learner.actor, context.expert),
@@ -58,24 +55,31 @@ def mappo(context: TrainContext) -> dict[str, ModGNN]:
         for size in sizes
     }
 
-    with TrainingLoop(context, {name: learner}, named_buffers(flocks, {}), settings.rounds, unit="rounds") as loop:
+    name = config.model.name
+    with TrainingLoop(context, {name: learner}, collectors, total=settings.rounds, unit="rounds") as loop:
         for index in loop.rounds(1, settings.rounds):
-            start = 0.0 if config.init_from is None else settings.kl_coef  # a fresh policy is nothing to stay near to
-            anchor = anchor_weight(index - 1 - settings.critic_warmup, start, settings.kl_rounds)
-            metrics = {"noise": learner.actor.noise, "kl_coef": anchor, "learning_rate": settings.learning_rate}
-            for size, group in flocks.items():
-                rollouts = loop.on_collect(group.collect())
-                metrics |= rollout_metrics(rollouts, env_config) | reward_metrics(rollouts, env_config)
-                losses = learner.update(rollouts, only_critic=index <= settings.critic_warmup, anchor=anchor)
-                metrics |= {f"{size}/{name}": value for name, value in losses.items()}
-            for key in ("reward", "error"):
-                metrics[key] = sum(metrics[f"{size}/{key}"] for size in sizes) / len(sizes)
-            scores = {name: -metrics["reward"]}
-            loop.log(metrics, 1, scores, reward=metrics["reward"], error=metrics["error"])
+            kl_coef = 0.0 if config.init_from is None else kl_coef_of_round(settings, index)
+            metrics = {"noise": learner.actor.noise, "kl_coef": kl_coef, "learning_rate": settings.learning_rate}
+            for size, collector in collectors.items():
+                rollouts = loop.on_collect(collector.collect())
+                metrics |= rollout_metrics(rollouts, config.env) | reward_metrics(rollouts, config.env)
+                losses = learner.update(rollouts, kl_coef=kl_coef, critic_only=index <= settings.critic_warmup)
+                metrics |= {f"{size}/{key}": value for key, value in losses.items()}
+            metrics["reward"] = reward = mean_over_sizes(metrics, "reward", sizes)
+            metrics["error"] = error = mean_over_sizes(metrics, "error", sizes)
+            loop.log(metrics, 1, {name: -reward}, reward=reward, error=error)
 
     return {name: learner.ema_policy}
 
 
-def anchor_weight(index: int, start: float, rounds: int) -> float:
-    """Weight of the pull towards the first policy in one round: ``start``, fading linearly to 0 over ``rounds``."""
-    return start if rounds == 0 else start * min(1.0, max(0.0, 1 - index / rounds))
+def kl_coef_of_round(settings: MAPPOConfig, index: int) -> float:
+    """The weight of the KL penalty in a round: ``kl_coef``, which decays to 0 over ``kl_rounds`` after the warm-up.
+
+    Args:
+        settings: of the trainer.
+        index: number of the round, from 1.
+    """
+    if settings.kl_rounds == 0:
+        return settings.kl_coef
+    done = (index - 1 - settings.critic_warmup) / settings.kl_rounds
+    return settings.kl_coef * min(1.0, max(0.0, 1 - done))

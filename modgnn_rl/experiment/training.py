@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import TrainConfig, as_list
 from modgnn_rl.configs.settings import check
+from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import one_line
 from modgnn_rl.experiment.evaluate import evaluate_policies
 from modgnn_rl.experiment.resume import changed_config, differences, requires_restart, stored_config
@@ -107,7 +108,7 @@ def resume(
             distributed.print_rank0(
                 "Flocks begin anew, with no data, in all processes but the first, whose flocks are kept"
             )
-        return _work(config, run, expert, callbacks, checkpoint, keeps_flocks=not anew, evaluate=evaluate)
+        return _work(config, run, expert, callbacks, checkpoint, restore_rollouts=not anew, evaluate=evaluate)
 
 
 def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainConfig:
@@ -142,18 +143,24 @@ def _work(
     callbacks: Sequence[Callback],
     checkpoint: Checkpoint | None = None,
     *,
-    keeps_flocks: bool = True,
+    restore_rollouts: bool = True,
     evaluate: bool,
 ) -> RunFolder:
     """Train from the beginning or from a checkpoint, then evaluate, which the first process does alone."""
     first = distributed.is_first()
     loggers = make_logger(config, run) if first else LoggerGroup({})
-    watches = [DashboardCallback(config, run, loggers, expert)] if loggers else []
-    with GracefulInterrupt().listen() as interruption:
+    dashboards = [DashboardCallback(config, run, loggers, expert)] if loggers else []
+    with GracefulInterrupt().listen() as interrupt:
         own = distributed.own_part(config, checkpoint.step if checkpoint else 0)
-        keeps_flocks = keeps_flocks and first
         context = TrainContext(
-            own, run, loggers, expert, [*callbacks, *watches], checkpoint, keeps_flocks, interruption
+            config=own,
+            expert=Reynolds.for_env(config.env) if expert is None else expert,
+            run=run,
+            loggers=loggers,
+            callbacks=[*callbacks, *dashboards],
+            checkpoint=checkpoint,
+            restore_rollouts=restore_rollouts and first,
+            interrupt=interrupt,
         )
         try:
             policies = TRAINERS[config.trainer.name].load()(context)

@@ -85,14 +85,14 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
 def test_a_checkpoint_holds_what_a_run_is_made_of(run):
     checkpoint = load_checkpoint(run.checkpoints)
     of_flocks = {
-        f"flocks-{name}.{part}" for name in ("5", "validation-5") for part in ("env", "carried", "mixture", "data")
+        f"{name}.{part}" for name in ("rollouts-5", "validation-5") for part in ("env", "carried", "mixture", "data")
     }
     assert set(checkpoint.tensors) == {"policy", "trained", "optimizer", "generators", *of_flocks}
     drawn = ("env", "faults", "noise", "places", "mixture", "disturbance", "batches")
     assert set(checkpoint.tensors["generators"]) == {
         "learner",
         "validation",
-        *(f"flocks-{name}.{role}" for name in ("5", "validation-5") for role in drawn),
+        *(f"{name}.{role}" for name in ("rollouts-5", "validation-5") for role in drawn),
     }
     assert checkpoint.state["config"] == run.config
     assert checkpoint.state["updates"] == checkpoint.state["averaged"] == 10

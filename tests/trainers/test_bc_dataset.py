@@ -73,7 +73,7 @@ def test_a_learner_fits_a_dataset(dataset: Path) -> None:
 def test_one_seed_fixes_a_run_and_its_generators_are_kept(tmp_path: Path, dataset: Path) -> None:
     runs = [run_bc(tmp_path, dataset, model="modgnn_mlp") for _ in range(2)]
     assert runs[0].metrics_file.read_bytes() == runs[1].metrics_file.read_bytes()
-    states = [load_checkpoint(run.checkpoints).tensors["generators"]["flocks-validation-5.batches"] for run in runs]
+    states = [load_checkpoint(run.checkpoints).tensors["generators"]["validation-5.batches"] for run in runs]
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], torch.Generator().manual_seed(0).get_state())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -20,7 +21,7 @@ from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.trainers.loop.setup import initial_policy, resolve_model
-from modgnn_rl.trainers.mappo import anchor_weight
+from modgnn_rl.trainers.mappo import kl_coef_of_round
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 
 WORLD = FlockingConfig(num_agents=4, max_steps=15)
@@ -87,10 +88,10 @@ def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, m
 def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
     run = train(_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15)), evaluate=False)
     checkpoint = load_checkpoint(run.checkpoints)
-    of_learner = {"policy", "actor", "critic", "value_norm", "anchor", "optimizer", "generators"}
-    of_flocks = {f"flocks-{size}.{part}" for size in (3, 5) for part in ("env", "carried")}
+    of_learner = {"policy", "actor", "critic", "value_norm", "reference_policy", "optimizer", "generators"}
+    of_flocks = {f"rollouts-{size}.{part}" for size in (3, 5) for part in ("env", "carried")}
     assert set(checkpoint.tensors) == of_learner | of_flocks
-    names = {f"flocks-{size}.{name}" for size in (3, 5) for name in ("env", "faults", "noise")}
+    names = {f"rollouts-{size}.{name}" for size in (3, 5) for name in ("env", "faults", "noise")}
     assert set(checkpoint.tensors["generators"]) == {"receivers", "order", *names}
     assert checkpoint.step == 3
     assert checkpoint.state["updates"] == 3 * 2 * 4  # rounds, sizes, updates
@@ -106,7 +107,7 @@ def test_each_size_has_metrics_of_its_own(cloned, tmp_path):
     assert [line["step"] for line in metrics] == [1, 2, 3]
     common = ("reward", "cost/leader", "cost/effort", "error", "cohesion", "loss_critic", "kl_approx", "entropy")
     assert all({f"{size}/{name}" for size in (3, 5) for name in common} <= set(line) for line in metrics)
-    assert [("3/loss_anchor" in line) for line in metrics] == [False, True, True]
+    assert [("3/loss_kl" in line) for line in metrics] == [False, True, True]
     assert [line["kl_coef"] for line in metrics] == pytest.approx([0.2, 0.2, 0.15])
     assert metrics[0]["noise"] == pytest.approx(0.3)
 
@@ -170,17 +171,18 @@ def test_flights_that_hold_no_window_are_refused_before_anything_is_created(tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_the_anchor_fades_linearly_after_the_warm_up():
-    assert [anchor_weight(index, 0.2, 4) for index in range(-2, 7)] == pytest.approx(
-        [0.2, 0.2, 0.2, 0.15, 0.1, 0.05, 0, 0, 0]
-    )
-    assert [anchor_weight(index, 0.2, 0) for index in (-1, 0, 1000)] == [0.2] * 3
+def test_the_weight_of_the_kl_penalty_decays_linearly_after_the_warm_up():
+    settings = MAPPOConfig(critic_warmup=2, kl_coef=0.2, kl_rounds=4)
+    weights = [kl_coef_of_round(settings, index) for index in range(1, 10)]
+    assert weights == pytest.approx([0.2, 0.2, 0.2, 0.15, 0.1, 0.05, 0, 0, 0])
+    constant = dataclasses.replace(settings, kl_rounds=0)
+    assert [kl_coef_of_round(constant, index) for index in (1, 2, 1000)] == [0.2] * 3
 
 
-def test_a_fresh_policy_is_not_held_back(tmp_path):
+def test_a_fresh_policy_has_no_kl_penalty(tmp_path):
     metrics = train(_config(tmp_path, kl_coef=100.0), evaluate=False).read_metrics()
     assert [line["kl_coef"] for line in metrics] == [0.0] * 3
-    assert not any("4/loss_anchor" in line for line in metrics)
+    assert not any("4/loss_kl" in line for line in metrics)
 
 
 def test_callbacks_can_stop_it(tmp_path):

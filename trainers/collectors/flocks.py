@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -16,7 +16,7 @@ from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, Ensemble, SafetyGate, ensemble_std
 from modgnn_rl.trainers.collectors.local import make_collector
 from modgnn_rl.trainers.collectors.windows import as_windows, reservoir_places, window_of
-from modgnn_rl.trainers.common.state import Checkpointable, TensorGroups
+from modgnn_rl.trainers.common.state import TensorGroups
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = [
@@ -24,7 +24,6 @@ __all__ = [
     "flocks_of",
     "make_buffers",
     "make_validation_buffers",
-    "named_buffers",
 ]
 
 
@@ -89,14 +88,14 @@ class FlockBuffer:
         )
         self.mixture.restart()  # the collector has tried the policy out
         self.seen = 0
-        self._owns_data = True
+        self.sampling = torch.Generator(device).manual_seed(derive_seed(seed, "batches"))
         # Not compilable ones would share their counters between processes, and start one of their own for that.
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(settings.capacity, device=device, compilable=True),
             writer=RoundRobinWriter(compilable=True),
             sampler=RandomSampler(),
             batch_size=settings.batch_size,
-            generator=torch.Generator(device).manual_seed(derive_seed(seed, "batches")),
+            generator=self.sampling,
         )
 
     def fly(self, beta: float) -> TensorDictBase:
@@ -123,19 +122,15 @@ class FlockBuffer:
             "places": self.noise,
             "mixture": self.mixture.generator,
             "disturbance": self.action_noise.generator,
-            "batches": self.buffer._rng,
+            "batches": self.sampling,
         }
-
-    def borrow(self, buffer: ReplayBuffer) -> None:
-        """Use data that somebody else keeps; checkpoints do not hold them."""
-        self.buffer, self._owns_data = buffer, False
 
     def state(self) -> tuple[TensorGroups, dict[str, Any]]:
         """What a checkpoint holds of rollouts and data."""
         tensors, values = self.rollouts.state()
         tensors["mixture"] = self.mixture.state()
         values |= {"disturbance": self.action_noise.scale, "seen": self.seen}
-        if self._owns_data and self.settings.checkpoint_data and len(self.buffer):
+        if self.settings.checkpoint_data and len(self.buffer):
             tensors["data"] = dict(self.buffer[:].flatten_keys("/").items())
             values["writer"] = self.buffer.writer.state_dict()
         return tensors, values
@@ -203,14 +198,6 @@ def make_validation_buffers(
         config, trainer=held_out, seed=derive_seed(config.seed, "validation"), collector=CollectorConfig()
     )
     return make_buffers(apart, policies, expert, steps=steps, hold_steps=hold_steps)
-
-
-def named_buffers(training: Mapping[int, Checkpointable], validation: Mapping[int, Checkpointable]) -> dict[str, Any]:
-    """All flocks of a run by the names that checkpoints give them."""
-    return {
-        **{str(size): group for size, group in training.items()},
-        **{f"validation-{size}": group for size, group in validation.items()},
-    }
 
 
 def flocks_of(size: int, config: TrainConfig) -> int:

@@ -1,4 +1,4 @@
-"""The imitation loss and what is done to its data: random receivers, random rotations."""
+"""The imitation loss, and the augmentations of its data."""
 
 from __future__ import annotations
 
@@ -33,24 +33,27 @@ def imitation_loss(
     Only the receivers' actions at the last step are computed.
 
     Args:
-        policy: the policy; run over the window.
+        policy: the policy; it is run over the window.
         batch: windows [S, W] with the policy's in-keys and the expert's action.
         receivers: the agents whose error counts, bool [S, N].
         expert_action: key of the expert's action [S, W, N, A].
+
+    Returns:
+        the loss, [].
     """
     expert = batch[expert_action]
-    wanted = _at_the_end(expert, receivers)
+    counted = _at_last_step(expert, receivers)
     with set_recurrent_mode(True):
-        action = policy(batch.copy(), receivers=wanted)[policy.out_keys[0]]
-    return (action - expert)[wanted].square().mean()
+        action = policy(batch.copy(), receivers=counted)[policy.out_keys[0]]
+    return (action - expert)[counted].square().mean()
 
 
 def stacked_losses(
     policies: Sequence[ModGNN], batch: TensorDictBase, receivers: Tensor, *, expert_action: NestedKey = EXPERT_ACTION
 ) -> list[Tensor]:
-    """`imitation_loss` of policies that differ in their weights only, computed at once (``torch.func.vmap``).
+    """`imitation_loss` of policies that differ only in their weights, computed at once with ``torch.func.vmap``.
 
-    The gradients are added to those that the weights hold.
+    The gradients are added to those of the weights.
 
     Args:
         policies: P of them.
@@ -59,16 +62,16 @@ def stacked_losses(
         expert_action: key of the expert's action [S, W, N, A].
 
     Returns:
-        the P losses, without gradient.
+        the P losses, [] each, without gradient.
     """
     expert = batch[expert_action]
-    wanted = _at_the_end(expert, receivers)
+    counted = _at_last_step(expert, receivers)
     weights, buffers = stack_module_state(list(policies))
 
     def loss_of(weights: dict[str, Tensor], buffers: dict[str, Tensor]) -> Tensor:
-        result = functional_call(policies[0], (weights, buffers), (batch.copy(),), {"receivers": wanted})
-        difference = torch.where(wanted.unsqueeze(-1), result[policies[0].out_keys[0]] - expert, 0.0)
-        return difference.square().sum() / (wanted.sum() * expert.shape[-1])
+        result = functional_call(policies[0], (weights, buffers), (batch.copy(),), {"receivers": counted})
+        difference = torch.where(counted.unsqueeze(-1), result[policies[0].out_keys[0]] - expert, 0.0)
+        return difference.square().sum() / (counted.sum() * expert.shape[-1])
 
     with set_recurrent_mode(True):
         losses = vmap(loss_of)(weights, buffers)
@@ -80,31 +83,32 @@ def stacked_losses(
     return list(losses.detach())
 
 
-def hide_velocities(batch: TensorDictBase, share: float, generator: torch.Generator) -> None:
-    """Zero the velocities of all agents in a random share of the windows [S, W], in place.
+def hide_velocities(batch: TensorDictBase, fraction: float, generator: torch.Generator) -> None:
+    """Set the velocities of all agents to zero in a random fraction of the windows [S, W], in place.
 
-    A cloned policy that reads its next action off its own velocity, a memory of the last one, runs away in rollout.
+    A cloned policy can read its next action off its own velocity, which remembers the last one; in closed loop such a
+    policy drifts away.
 
     Args:
         batch: with observations (position, velocity) [S, W, N, 6], and without stored messages.
-        share: probability that a window is chosen.
+        fraction: probability that a window is chosen.
         generator: source of randomness.
     """
     observation = batch["agents", "observation"]
-    lot = torch.rand(len(batch), generator=generator, device=generator.device).to(observation.device)
-    hidden = (lot < share)[:, None, None, None] & (torch.arange(6, device=observation.device) >= 3)
+    chance = torch.rand(len(batch), generator=generator, device=generator.device).to(observation.device)
+    hidden = (chance < fraction)[:, None, None, None] & (torch.arange(6, device=observation.device) >= 3)
     batch["agents", "observation"] = observation.masked_fill(hidden, 0.0)
 
 
-def _at_the_end(actions: Tensor, receivers: Tensor) -> Tensor:
-    """The receivers [S, N] at the last step of windows, which actions [S, W, N, A] are of; bool [S, W, N]."""
-    wanted = torch.zeros_like(actions[..., 0], dtype=torch.bool)
-    wanted[:, -1] = receivers
-    return wanted
+def _at_last_step(actions: Tensor, receivers: Tensor) -> Tensor:
+    """Receivers [S, N] at the last step of the windows of actions [S, W, N, A], as bool [S, W, N]."""
+    counted = torch.zeros_like(actions[..., 0], dtype=torch.bool)
+    counted[:, -1] = receivers
+    return counted
 
 
 def random_rotations(count: int, like: Tensor, generator: torch.Generator) -> Tensor:
-    """Rotation matrices [count, 3, 3], uniform over SO(3), of the type and device of ``like``."""
+    """Rotation matrices [count, 3, 3], uniform over SO(3), with the dtype and device of ``like``."""
     quaternion = torch.randn(count, 4, generator=generator, device=generator.device, dtype=like.dtype).to(like.device)
     w, x, y, z = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = (
@@ -116,6 +120,6 @@ def random_rotations(count: int, like: Tensor, generator: torch.Generator) -> Te
 
 
 def rotate(vectors: Tensor, rotations: Tensor) -> Tensor:
-    """Rotate data made of 3-vectors [S, ..., 3 n] by one matrix a sample [S, 3, 3]."""
+    """Rotate data that consist of 3-vectors, [S, ..., 3 n], by one matrix per sample, [S, 3, 3]."""
     flat = vectors.flatten(1, -2).unflatten(-1, (-1, 3)).flatten(1, 2)
     return (flat @ rotations.transpose(-1, -2)).reshape(vectors.shape)

@@ -1,4 +1,4 @@
-"""What a trainer works with: settings, where its work goes, what it goes on from."""
+"""What a trainer is given: settings, expert, callbacks, and where to write and to start from."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import TrainConfig
-from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.tracking.checkpoint import Checkpoint
 from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
@@ -18,31 +17,28 @@ from modgnn_rl.utils.signals import GracefulInterrupt
 __all__ = ["TrainContext"]
 
 
-@dataclass
+@dataclass(frozen=True)
 class TrainContext:
-    """One training run, or what is left of it.
+    """One training run.
+
+    A trainer reads `config` and `expert`; the rest is for `modgnn_rl.trainers.loop.training_loop.TrainingLoop`.
 
     Attributes:
-        config: the run's settings.
-        run: the folder to leave metrics and checkpoints in.
-        loggers: where metrics go besides.
-        expert: writes ``("agents", "expert_action")``; default: Reynolds flocking.
-        callbacks: people's own code.
-        checkpoint: what the run goes on from; None: it begins.
-        keeps_flocks: whether flocks and data go on too, or begin anew.
-        interruption: signals from outside.
+        config: all settings, checked; in distributed training those of this process.
+        expert: labels every state, under ``("agents", "expert_action")``.
+        run: folder for metrics and checkpoints.
+        loggers: where metrics go in addition to ``metrics.jsonl``.
+        callbacks: called at the start, after every collection of rollouts, after every round, and at the end.
+        checkpoint: where the run resumes from; None at the start.
+        restore_rollouts: whether to resume environments and training data from the checkpoint too.
+        interrupt: signals from outside, such as Ctrl-C.
     """
 
     config: TrainConfig
+    expert: TensorDictModuleBase
     run: RunFolder
     loggers: LoggerGroup
-    expert: TensorDictModuleBase = None
     callbacks: Sequence[Callback] = ()
     checkpoint: Checkpoint | None = None
-    keeps_flocks: bool = True
-    interruption: GracefulInterrupt = field(default_factory=GracefulInterrupt)
-
-    def __post_init__(self) -> None:
-        """Choose the expert."""
-        if self.expert is None:
-            self.expert = Reynolds.for_env(self.config.env)
+    restore_rollouts: bool = True
+    interrupt: GracefulInterrupt = field(default_factory=GracefulInterrupt)

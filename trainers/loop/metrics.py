@@ -1,6 +1,8 @@
-"""What is measured on the rollouts that trainers collect."""
+"""Metrics of the rollouts that trainers collect."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -18,27 +20,28 @@ from modgnn_rl.envs.flocking.metrics import (
 from modgnn_rl.envs.flocking.rewards import flocking_costs
 from modgnn_rl.utils.tensors import pair_distances
 
-__all__ = ["reward_metrics", "rollout_metrics"]
+__all__ = ["mean_over_sizes", "reward_metrics", "rollout_metrics"]
 
-FRAMES = 4  # steps of a batch of rollouts at which the geometry is measured
+FRAMES = 4  # steps of a rollout at which distances are measured
 
 
 def rollout_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dict[str, float]:
-    """Metrics of rollouts that a trainer collected; names begin with the number of agents.
+    """Metrics of rollouts that a trainer has collected.
 
     Args:
-        rollouts: [B, T]; where the expert flew some, with who did under ``expert_flies`` [B, T, 1].
-        env_config: says when a flock has diverged or is lost.
+        rollouts: [B, T]; if the expert acted in some, ``expert_flies`` [B, T, 1] tells in which.
+        env_config: defines when a flock has diverged or lost its leader.
 
     Returns:
-        the error of the actions where the policy flew (NaN where the expert flew throughout), and at a few steps,
-        whoever flew, the other metrics of `modgnn_rl.envs.flocking.metrics`.
+        by name, which begins with the number of agents: the error of the actions of the policy (NaN if the expert acted
+        throughout), the fraction of steps in which the expert acted, and at a few steps, whoever acted, the other
+        metrics of `modgnn_rl.envs.flocking.metrics`.
     """
     agents = rollouts["agents"]
-    flown, expert_flies = agents["controlled"], rollouts.get("expert_flies", None)
-    if expert_flies is not None:
-        flown = flown & ~expert_flies
-    error = action_error(agents.get("loc", agents["action"]), agents["expert_action"], flown).nanmean()
+    counted, expert_acts = agents["controlled"], rollouts.get("expert_flies", None)
+    if expert_acts is not None:
+        counted = counted & ~expert_acts
+    error = action_error(agents.get("loc", agents["action"]), agents["expert_action"], counted).nanmean()
     frames = torch.linspace(0, rollouts.shape[1] - 1, FRAMES).long()
     position = rollouts[env_config.state_key][:, frames, :, :3]
     measured = {
@@ -50,20 +53,20 @@ def rollout_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dic
         "lost": leader_lost(position, env_config.comm_range).double().mean(),
         "diverged": is_diverged(position, env_config.max_distance).double().mean(),
     }
-    if expert_flies is not None:
-        measured["expert_flew"] = expert_flies.double().mean()
+    if expert_acts is not None:
+        measured["expert_fraction"] = expert_acts.double().mean()
     return {f"{position.shape[-2]}/{name}": float(value) for name, value in measured.items()}
 
 
 def reward_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dict[str, float]:
-    """Mean reward of a step and of an agent that is flown, and each cost that makes it up, unweighted.
+    """Mean reward per step and controlled agent, and each of its costs, unweighted.
 
     Args:
         rollouts: [B, T].
-        env_config: its weights.
+        env_config: defines collisions and crowding.
 
     Returns:
-        by name; names begin with the number of agents.
+        by name, which begins with the number of agents.
     """
     state = rollouts["next", *env_config.state_key]
     position, velocity = state.split(3, -1)
@@ -77,7 +80,12 @@ def reward_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dict
         collision_distance=env_config.collision_distance,
         exists=exists,
     )
-    flown = rollouts["agents", "controlled"]
-    measured = {f"cost/{name}": cost[flown].mean() for name, cost in costs.items()}
-    measured["reward"] = rollouts["next", "agents", "reward"][flown].mean()
+    counted = rollouts["agents", "controlled"]
+    measured = {f"cost/{name}": cost[counted].mean() for name, cost in costs.items()}
+    measured["reward"] = rollouts["next", "agents", "reward"][counted].mean()
     return {f"{position.shape[-2]}/{name}": float(value) for name, value in measured.items()}
+
+
+def mean_over_sizes(metrics: Mapping[str, float], name: str, sizes: Sequence[int]) -> float:
+    """The mean of the metrics ``<size>/<name>``."""
+    return sum(metrics[f"{size}/{name}"] for size in sizes) / len(sizes)

@@ -1,4 +1,4 @@
-"""The loss of MAPPO with a KL penalty towards the initial policy."""
+"""The loss of MAPPO with a KL penalty towards a reference policy."""
 
 from __future__ import annotations
 
@@ -12,55 +12,66 @@ from torchrl.objectives import MAPPOLoss
 
 from modgnn_rl.trainers.common import distributed
 
-__all__ = ["ANCHOR", "KLPenaltyMAPPOLoss", "SharedValueNorm"]
+__all__ = ["REFERENCE_ACTION", "KLPenaltyMAPPOLoss", "SharedValueNorm"]
 
-ANCHOR = ("agents", "anchor")
+REFERENCE_ACTION = ("agents", "reference_action")
+MASK = ("collector", "mask")  # which entries of the data count, in TorchRL's losses too
 
 
 class KLPenaltyMAPPOLoss(MAPPOLoss):
-    """TorchRL's `MAPPOLoss` with a pull towards the actions of another policy.
+    """TorchRL's `MAPPOLoss` with a penalty for the divergence from a reference policy.
 
-    Where the data have its actions under ``anchor`` [*B, N, A], the result has also ``loss_anchor``: ``anchor_coeff``
-    times the Kullback-Leibler divergence ``|mu - anchor|^2 / (2 sigma^2)`` of two normal distributions of one width.
+    Where the data have the reference policy's actions ``a_ref``, the result also has ``loss_kl``: `kl_coef` times
+    the Kullback-Leibler divergence ``|mu - a_ref|^2 / (2 sigma^2)`` of two normal distributions of equal sigma.
 
     Args:
-        anchor: key of the other policy's actions.
-        anchor_coeff: weight of the pull; an attribute, which may be changed at any time.
-        arguments, options: see `torchrl.objectives.multiagent.MAPPOLoss`.
+        arguments, options: see `torchrl.objectives.multiagent.MAPPOLoss`. The last but one module of the actor's
+            sequence writes the parameters of its distribution.
+        reference_action: key of the reference policy's actions [*B, N, A].
+        kl_coef: weight of the penalty; the attribute may be changed at any time.
     """
 
-    def __init__(self, *arguments: Any, anchor: Any = ANCHOR, anchor_coeff: float = 0.0, **options: Any) -> None:
+    def __init__(
+        self, *arguments: Any, reference_action: Any = REFERENCE_ACTION, kl_coef: float = 0.0, **options: Any
+    ) -> None:
         super().__init__(*arguments, **options)
-        self.anchor_key, self.anchor_coeff = anchor, anchor_coeff
-        self._dist: Any = None
-
-    def _get_cur_log_prob(self, tensordict: TensorDictBase, params: Any = None) -> Any:
-        found = super()._get_cur_log_prob(tensordict, params)
-        self._dist = found[1]
-        return found
+        self.reference_action_key, self.kl_coef = reference_action, kl_coef
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Compute all losses, see `MAPPOLoss`; unlike there, ``kl_approx`` and ``clip_fraction`` heed the mask."""
-        losses = super().forward(tensordict)
-        dist, self._dist = self._dist, None
-        anchor = tensordict.get(self.anchor_key, None)
-        if anchor is not None:
-            divergence = ((dist.mean - anchor) / dist.stddev).square().sum(-1, keepdim=True) / 2
-            losses.set("loss_anchor", self.anchor_coeff * self._reduce_loss(divergence, tensordict))
+        """Compute all losses, see `MAPPOLoss`; unlike there, ``kl_approx`` and ``clip_fraction`` respect the mask."""
+        # The distribution that the loss computes is needed here too, and a second forward pass would double the time.
+        outputs: list[TensorDictBase] = []
+        parameters = self.actor_network[-2]
+        with parameters.register_forward_hook(lambda module, inputs, output: outputs.append(output)):
+            losses = super().forward(tensordict)
+        dist = self.actor_network.build_dist_from_params(outputs[0])
+        mask = tensordict.get(MASK, None)
+        reference = tensordict.get(self.reference_action_key, None)
+        if reference is not None:
+            divergence = ((dist.mean - reference) / dist.stddev).square().sum(-1, keepdim=True) / 2
+            losses.set("loss_kl", self.kl_coef * masked_mean(divergence, mask))
         with torch.no_grad():
             action, before = (tensordict[key] for key in (self.tensor_keys.action, self.tensor_keys.sample_log_prob))
-            ratio = (dist.log_prob(action) - before).unsqueeze(-1)
-            low, high = self._clip_bounds
-            clipped = ((ratio < low) | (ratio > high)).to(ratio.dtype)
-            losses.set("kl_approx", self._reduce_loss(ratio.exp() - 1 - ratio, tensordict))
-            losses.set("clip_fraction", self._reduce_loss(clipped, tensordict))
+            log_ratio = (dist.log_prob(action) - before).unsqueeze(-1)
+            low, high = (-self.clip_epsilon).log1p(), self.clip_epsilon.log1p()
+            clipped = ((log_ratio < low) | (log_ratio > high)).to(log_ratio.dtype)
+            losses.set("kl_approx", masked_mean(log_ratio.exp() - 1 - log_ratio, mask))
+            losses.set("clip_fraction", masked_mean(clipped, mask))
         return losses
 
 
+def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
+    """The mean of values [*B] where a mask, bool [*B], is true; of all values without a mask."""
+    if mask is None:
+        return values.mean()
+    # Entries that are masked out may be NaN, so they are not multiplied by zero.
+    return torch.where(mask, values, torch.zeros_like(values)).sum() / mask.sum().clamp_min(1)
+
+
 class SharedValueNorm(PopArtValueNorm):
-    """TorchRL's `PopArtValueNorm` over the batches of all processes, which are equally large."""
+    """TorchRL's `PopArtValueNorm` over the batches of all processes in distributed training, equally large each."""
 
     def update(self, value_target: Tensor) -> None:
-        """Fold in a batch of value targets [*B, 1] of each process."""
+        """Update the running moments with a batch of value targets [*B, 1] of each process."""
         super().update(value_target)
         distributed.average(self.running_mean, self.running_mean_sq)

@@ -250,7 +250,7 @@ def test_a_strict_gate_lets_the_expert_fly_and_a_lax_one_does_not(tmp_path):
             gate_threshold=threshold,
             beta=0.0,
         )
-        shares.append([line["4/expert_flew"] for line in run.read_metrics()[1:]])
+        shares.append([line["4/expert_fraction"] for line in run.read_metrics()[1:]])
     assert shares == [[1.0] * 4, [0.0] * 4]
 
 

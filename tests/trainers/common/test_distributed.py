@@ -155,11 +155,11 @@ def test_improving_on_parts_of_the_flights_is_improving_on_the_whole(tmp_path):
 
     def update():
         learner = PPOLearner(make_model("moment_force", seed=0), settings, WORLD.state_key, seed=0)
-        for module in (learner.actor, learner.averaged, learner.anchor, learner.critic, learner.loss):
+        for module in (learner.actor, learner.averaged, learner.reference_policy, learner.critic, learner.loss):
             module.double()
         for number, each in enumerate(rollouts):
             own = each[2 * distributed.rank() :][:2] if distributed.size() > 1 else each
-            learner.update(own.clone(), only_critic=number == 0, anchor=0.1)
+            learner.update(own.clone(), critic_only=number == 0, kl_coef=0.1)
         return _weights(learner)
 
     alone = update()

@@ -11,7 +11,7 @@ from torch import nn
 
 from modgnn_rl.configs.schema import DAggerConfig
 from modgnn_rl.errors import NotFinite
-from modgnn_rl.trainers.common.optimization import PATIENCE, GuardedOptimizer
+from modgnn_rl.trainers.common.optimization import MAX_SKIPPED, GuardedOptimizer
 
 ALL = torch.tensor(12)  # agents that count in a batch
 
@@ -54,7 +54,7 @@ def _spoil_gradient(model, batch):
 
 SPOILT = {
     r"\('agents', 'observation'\) of agent 0 at step 1 of window 2 of its data is nan": _spoil_data,
-    "its loss is (inf|nan) on data that are finite": _spoil_loss,
+    "its loss is (inf|nan) although its data are finite": _spoil_loss,
     "the gradient of bias is not finite": _spoil_gradient,
 }
 
@@ -79,7 +79,7 @@ def test_no_step_is_taken_and_what_is_wrong_is_named(message, on_nonfinite):
     loss = SPOILT[message](model, batch)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     if on_nonfinite == "stop":
-        with pytest.raises(NotFinite, match=f"update 7 was not made, since {message}"):
+        with pytest.raises(NotFinite, match=f"update 7 was not made because {message}"):
             stepper.step(7, loss, batch, ALL)
     else:
         with pytest.warns(RuntimeWarning, match=message):
@@ -92,11 +92,11 @@ def test_too_many_in_a_row_stop_and_one_good_one_counts_anew():
 
     def skip(times):
         for _ in range(times):
-            with pytest.warns(RuntimeWarning, match="training goes on"):
+            with pytest.warns(RuntimeWarning, match="training continues"):
                 stepper.step(1, _spoil_gradient(model, _batch()), _batch(), ALL)
 
-    skip(PATIENCE - 1)
+    skip(MAX_SKIPPED - 1)
     assert stepper.step(1, _backward(model, _batch()), _batch(), ALL)
-    skip(PATIENCE - 1)
+    skip(MAX_SKIPPED - 1)
     with pytest.raises(NotFinite, match="resume with smaller steps"):
         stepper.step(1, _spoil_gradient(model, _batch()), _batch(), ALL)

@@ -47,7 +47,7 @@ def test_before_the_first_update_what_was_flown_is_recomputed_exactly(name, mode
     for _ in range(3):
         rollouts = collector.collect()
         began += int(rollouts["is_init"][:, 1:].sum())
-        assert abs(learner.update(rollouts, only_critic=True)["kl_approx"]) < 1e-6
+        assert abs(learner.update(rollouts, critic_only=True)["kl_approx"]) < 1e-6
     assert began > 0
     assert all(torch.equal(value, before[key]) for key, value in learner.actor.state_dict().items())
     assert torch.equal(_weights(learner.ema_policy), _weights(learner.policy))
@@ -123,8 +123,8 @@ def test_judging_leaves_the_flights_as_they_were_flown():
         assert torch.equal(rollouts[key].nan_to_num(7.0), value.nan_to_num(7.0)), key
 
 
-def _losses(learner, rollouts, receivers, anchor):
-    learner.loss.anchor_coeff = anchor
+def _losses(learner, rollouts, receivers, kl_coef):
+    learner.loss.kl_coef = kl_coef
     learner.compute_advantages(rollouts)
     batch = rollouts.copy()
     batch[RECEIVERS] = receivers
@@ -139,15 +139,15 @@ def test_losses_are_those_of_torch_distributions():
         for parameter in learner.actor.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
     receivers = rollouts["agents", "controlled"] & (torch.arange(AGENTS) != 3)
-    losses = _losses(learner, rollouts, receivers, anchor=0.7)
+    losses = _losses(learner, rollouts, receivers, kl_coef=0.7)
     with set_recurrent_mode(True):
         mean, old = (
             policy(rollouts.select(*policy.in_keys, strict=False))["agents", "action"]
-            for policy in (learner.policy, learner.anchor)
+            for policy in (learner.policy, learner.reference_policy)
         )
     sigma = learner.actor.noise
-    now, anchor = (Independent(Normal(centre, sigma), 1) for centre in (mean, old))
-    torch.testing.assert_close(losses["loss_anchor"], 0.7 * kl_divergence(now, anchor)[receivers].mean())
+    now, reference = (Independent(Normal(centre, sigma), 1) for centre in (mean, old))
+    torch.testing.assert_close(losses["loss_kl"], 0.7 * kl_divergence(now, reference)[receivers].mean())
     torch.testing.assert_close(losses["loss_entropy"], -0.01 * now.entropy()[receivers].mean())
 
     log_ratio = (now.log_prob(rollouts["agents", "action"]) - rollouts["agents", "action_log_prob"])[receivers]
@@ -174,7 +174,7 @@ def test_the_leader_and_the_burn_in_reach_no_gradient(name, model):
                 rollouts["agents", key][:, :, 0] += rubbish
 
         learner.compute_advantages = spoiled
-        learner.update(rollouts, anchor=0.1)
+        learner.update(rollouts, kl_coef=0.1)
         weights.append((_weights(learner.policy), _weights(learner.actor)))
     assert torch.equal(weights[0][0], weights[1][0])
     assert torch.equal(weights[0][1], weights[1][1])
@@ -198,17 +198,19 @@ def test_steps_of_the_burn_in_are_not_chosen():
         assert (chosen[:, 2:] == controlled[:, 2:]).all()  # as many agents as fit
 
 
-def test_a_huge_anchor_keeps_the_policy_where_it_began():
+def test_a_large_kl_penalty_keeps_the_policy_near_the_reference_policy():
     moved = []
-    for anchor in (0.0, 1e3):
+    for kl_coef in (0.0, 1e3):
         learner = _learner("modgnn_mlp", learning_rate=3e-3, epochs=2)
         collector = _collector(learner)
         for _ in range(3):
             rollouts = collector.collect()
-            learner.update(rollouts, anchor=anchor)
+            learner.update(rollouts, kl_coef=kl_coef)
         data = rollouts.select(*learner.policy.in_keys, strict=False)
         with torch.no_grad(), set_recurrent_mode(True):
-            action, before = (policy(data.copy())["agents", "action"] for policy in (learner.policy, learner.anchor))
+            action, before = (
+                policy(data.copy())["agents", "action"] for policy in (learner.policy, learner.reference_policy)
+            )
         moved.append(float((action - before)[rollouts["agents", "controlled"]].square().mean().sqrt()))
     assert moved[1] < 0.3 * moved[0]
 
@@ -216,7 +218,7 @@ def test_a_huge_anchor_keeps_the_policy_where_it_began():
 def test_the_losses_of_a_critic_fall():
     learner = _learner(critic_learning_rate=1e-2, epochs=4)
     rollouts = _collector(learner).collect()
-    losses = [learner.update(rollouts.clone(), only_critic=True)["loss_critic"] for _ in range(6)]
+    losses = [learner.update(rollouts.clone(), critic_only=True)["loss_critic"] for _ in range(6)]
     assert losses[-1] < 0.5 * losses[0]
 
 
@@ -228,4 +230,4 @@ def test_updates_move_policy_sigma_and_average():
     assert all(not torch.equal(value, before[name]) for name, value in learner.actor.state_dict().items())
     assert not torch.equal(_weights(learner.ema_policy), _weights(learner.policy))
     began = torch.cat([value.flatten().double() for name, value in before.items() if "policy" in name])
-    assert torch.equal(_weights(learner.anchor), began)
+    assert torch.equal(_weights(learner.reference_policy), began)
