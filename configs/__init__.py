@@ -1,1 +1,1 @@
-"""Settings and their YAML files."""
+"""Settings: dataclasses with defaults, documentation and ranges, and presets as YAML files."""

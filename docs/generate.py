@@ -1,7 +1,8 @@
-"""The pages that are made from the configuration itself: every command, every choice, every setting.
+"""Reference pages generated from the code: every command, every choice, every setting.
 
-``docs/conf.py`` writes them with `write_pages` whenever the site is built. A command is whatever has a YAML file
-at the top of ``configs/``; what it is made of is what it declares to `modgnn_rl.cli.command.run_command`.
+``docs/conf.py`` writes them with `write_pages` whenever the site is built. Each YAML file at the
+top of ``configs/`` belongs to a command, whose module passes its function and settings to
+`modgnn_rl.cli.command.run_command`.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ WORDS = {bool: "true or false", int: "whole number", float: "number", str: "text
 
 
 class Command(NamedTuple):
-    """A command as it declares itself: what runs, and the dataclass of its settings."""
+    """What a command passes to `run_command`: its function, and the dataclass of its settings."""
 
     name: str
     main: Callable[..., Any]
@@ -43,13 +44,13 @@ class Command(NamedTuple):
 
 @dataclasses.dataclass
 class Section:
-    """The settings of one dataclass where commands have it.
+    """The settings of one dataclass at one place in the configuration.
 
     Attributes:
-        prefix: how they are addressed, as in ``env``; empty for a command's own.
+        prefix: where they are, as in ``env``; empty for a command's own.
         kind: the dataclass.
-        commands: names of the commands that have them.
-        presets: what choices set them to, by choice, as in ``{"env=paper": {"separation_gain": 0.7}}``.
+        commands: names of the commands with these settings.
+        presets: values set by choices, as in ``{"env=paper": {"separation_gain": 0.7}}``.
     """
 
     prefix: str
@@ -73,7 +74,7 @@ def commands() -> list[Command]:
 
 
 def write_pages(folder: Path, pages: Mapping[str, str]) -> None:
-    """Write pages into a folder, those that changed, and remove those that are no longer there."""
+    """Write the pages that changed into a folder, and remove those that no longer exist."""
     folder.mkdir(parents=True, exist_ok=True)
     for page in folder.glob("*.md"):
         if page.name not in pages:
@@ -85,7 +86,7 @@ def write_pages(folder: Path, pages: Mapping[str, str]) -> None:
 
 
 def reference_pages() -> dict[str, str]:
-    """The pages by their file names."""
+    """The pages by file name."""
     known = commands()
     sections = _sections(known)
     return {"commands.md": _commands_page(known, sections), "settings.md": _settings_page(sections)}
@@ -166,9 +167,9 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def _commands_page(known: list[Command], sections: list[Section]) -> str:
-    """One part for each command: what it does, its choices, its settings."""
+    """One section for each command: what it does, its choices, its settings."""
     lines = ["# Commands", "", "Every command takes choices and settings in any order, and flags before or after them."]
-    lines += ["`--help` shows all with the values that they have under the choices given beside it.", ""]
+    lines += ["`--help` lists them with their values under the choices on the command line.", ""]
     lines += ["| command | |", "|---|---|"]
     lines += [f"| [`python -m modgnn_rl.{c.name}`](#{c.name}) | {_cell(_summary(c))} |" for c in known]
     for command in known:
@@ -194,10 +195,10 @@ def _commands_page(known: list[Command], sections: list[Section]) -> str:
 
 
 def _settings_page(sections: list[Section]) -> str:
-    """One part for each dataclass that stands below a command's own settings."""
-    lines = ["# Settings", "", "Set on the command line, as in `env.comm_range=5`, or in a YAML file, whose folder"]
-    lines += ["`--config-dir` names. What choices set otherwise than by default is said beside each setting;"]
-    lines += ["what a command has beside these is with the [commands](commands.md).", ""]
+    """One section for each dataclass nested in the settings of a command."""
+    lines = ["# Settings", "", "Set on the command line, as in `env.comm_range=5`, or in a YAML file whose folder"]
+    lines += ["is given by `--config-dir`. The values that presets set are listed with each setting;"]
+    lines += ["for settings of a single command see [commands](commands.md).", ""]
     for section in sorted((section for section in sections if section.prefix), key=lambda s: _title(s, sections)):
         title = _title(section, sections)
         used = ", ".join(f"[{name}](commands.md#{name})" for name in section.commands)
@@ -208,7 +209,7 @@ def _settings_page(sections: list[Section]) -> str:
 
 
 def _title(section: Section, sections: Iterable[Section]) -> str:
-    """What a section is called: where its settings are, and the choice or the command if there are several such."""
+    """Title of a section: its place, and the choice or the command if several sections are there."""
     alike = [other for other in sections if other.prefix == section.prefix]
     if not section.prefix or len(alike) == 1 or len(section.presets) > 1:
         return section.prefix
@@ -216,7 +217,7 @@ def _title(section: Section, sections: Iterable[Section]) -> str:
 
 
 def _is_repeated(section: Section, sections: Iterable[Section]) -> bool:
-    """Whether all settings of a section are, but for their defaults, documented under the same names elsewhere."""
+    """Whether another section documents all settings of this one, apart from their defaults."""
     mine = [field.metadata for field in dataclasses.fields(section.kind)]
     others = [other for other in sections if other.prefix == section.prefix and len(other.presets) > 1]
     return any(
@@ -227,13 +228,13 @@ def _is_repeated(section: Section, sections: Iterable[Section]) -> bool:
 
 
 def _names(section: Section) -> list[str]:
-    """The settings of a section by name, linked to where they are documented."""
+    """The names of the settings of a section, linked to their documentation."""
     names = [f"{section.prefix}.{field.name}" for field in dataclasses.fields(section.kind)]
     return [", ".join(f"[`{name}`](#{_slug(name, '-')})" for name in names) + "."]
 
 
 def _table(section: Section, place: str) -> list[str]:
-    """The settings of a section with their defaults, legal values, documentation and what choices set them to."""
+    """A table of the settings of a section: default, legal values, documentation, values set by choices."""
     hints = typing.get_type_hints(section.kind)
     lines = ["{.settings}", "| setting | default | legal | what it does |", "|---|---|---|---|"]
     for field in dataclasses.fields(section.kind):
