@@ -1,11 +1,12 @@
-"""Environments: physics engines behind one interface, and the flocking environment for TorchRL and Gymnasium."""
+"""Environments: flocks of quadcopters that follow a leader, for TorchRL, Gymnasium and PettingZoo.
 
+Importing this package registers ``modgnn_rl/Flocking-v0`` with Gymnasium; its public names are imported on first use.
+"""
+
+import lazy_loader
 from gymnasium.envs.registration import register, registry
 
-from modgnn_rl.envs.flocking.env import FlockingEnv
-from modgnn_rl.envs.flocking.physics.engine import Physics, TorchPhysics
-
-__all__ = ["FlockingEnv", "Physics", "TorchPhysics"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 if "modgnn_rl/Flocking-v0" not in registry:
     register(

@@ -1,1 +1,8 @@
-"""The flocking task: quadcopters that follow a leader."""
+"""The flocking task: environment, leader, expert, metrics, rewards, physics, rendering and adapters.
+
+Public names are imported on first use.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -166,7 +166,12 @@ class GymnasiumVectorFlocking(VectorEnv[Observation, Array, Array]):
             as_array(data[name].squeeze(-1)).astype(bool) for name in ("terminated", "truncated", "done")
         )
         if done.any():
-            final = {"final_obs": observation, "final_info": info, "_final_obs": done, "_final_info": done}
+            final: dict[str, Any] = {
+                "final_obs": observation,
+                "final_info": info,
+                "_final_obs": done,
+                "_final_info": done,
+            }
             after_reset = self.flocks.reset(None, None, done)
             observation = _where(done, self.flocks.observe(after_reset), observation)
             agent_rewards = info["agent_rewards"]

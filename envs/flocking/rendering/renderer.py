@@ -32,7 +32,7 @@ VIEW = np.array([-0.45, -0.85, 0.38])  # from the flock to the camera
 FIELD_OF_VIEW = 30.0  # vertical, degrees
 MIN_VIEW = 1.0  # m from the centre to the border
 OVERSAMPLING = 2
-LEVEL = (0.0, 0.0, 0.0, 1.0)  # quaternion
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])  # quaternion
 BACKGROUND = np.array([[251, 252, 254], [229, 234, 241]])  # top and bottom
 WINDOW_BACKGROUND = " ".join(f"--background_color_{name}=0.95" for name in ("red", "green", "blue"))
 HAZE = 0.4  # fraction of the background in the colour of the farthest parts
@@ -126,7 +126,7 @@ class Renderer:
         if not self.bullet.isConnected(self.client):
             raise InputError("cannot draw: the window or the environment has been closed")
         edges = np.asarray(frame.position, np.float64)[shortest_edges(frame, MAX_EDGES)]
-        drawn = np.isfinite(frame.position).all(-1)
+        drawn: Array = np.asarray(np.isfinite(frame.position).all(-1))
         quaternion = np.tile(LEVEL, (len(drawn), 1)) if frame.quaternion is None else frame.quaternion
         agents = _Agents(
             *(np.asarray(part, np.float64)[drawn] for part in (frame.position, quaternion, frame.target_velocity))
