@@ -129,7 +129,7 @@ def preset_of(command: Command, group: str, choice: str) -> tuple[type | None, d
     """The dataclass of a choice, if it has one of its own, and the values that it sets other than the defaults."""
     field = {field.name: field for field in dataclasses.fields(command.schema)}[group]
     if choice in field.metadata.get("registry", ()):
-        return type(choice_settings(field, choice)), {"name": choice}
+        return type(choice_settings(field, choice, load=True)), {"name": choice}
     kind: type | None = None
     values: dict[str, Any] = {}
     for entry in _defaults(f"{group}/{choice}"):

@@ -22,6 +22,7 @@ import ast
 import functools
 import importlib
 import importlib.util
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
@@ -41,6 +42,11 @@ class Reference:
 
     module: str
     name: str
+
+    @property
+    def is_cheap(self) -> bool:
+        """Whether `load` is quick: the module is imported already, or holds settings, which do not import torch."""
+        return self.module in sys.modules or self.module.startswith("modgnn_rl.configs.")
 
     def load(self) -> Any:
         """Import the module and return the object."""

@@ -83,8 +83,9 @@ def run_command(
     flags = _parse_flags(sys.argv[1:])
     jobs = Jobs(command, keep_going=flags.multirun)
     with tempfile.TemporaryDirectory(prefix="modgnn_rl-") as scratch, _exit_codes(command, jobs):
-        has_own_files = flags.config_dir or any(given.startswith("hydra.searchpath") for given in flags.overrides)
-        register(command, flags.overrides, import_all=bool(has_own_files), scratch=scratch)
+        typed = [os.environ.get("COMP_LINE", "")] if flags.shell_completion else flags.overrides
+        own_files = flags.config_dir or any(argument.startswith("hydra.searchpath") for argument in typed)
+        register(command, typed, load_all=bool(own_files), scratch=scratch)
         if flags.shell_completion:
             answer_tab(functools.partial(compose, command, jobs.run), flags.overrides, schema)
         else:

@@ -21,7 +21,7 @@ from modgnn_rl.cli.help import children, fields, help_text
 from modgnn_rl.cli.messages import explain, unknown_setting
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
-from modgnn_rl.registry import Registry
+from modgnn_rl.registry import Reference, Registry
 
 __all__ = [
     "Command",
@@ -51,13 +51,13 @@ class Command(NamedTuple):
     config_path: str
 
 
-def register(command: Command, arguments: Sequence[str], *, import_all: bool, scratch: str) -> None:
+def register(command: Command, arguments: Sequence[str], *, load_all: bool, scratch: str) -> None:
     """Give Hydra the command's dataclasses, its registered choices, its help, and defaults that write nothing.
 
     Args:
         command: the command.
-        arguments: command line; a choice of an installed package is imported if an argument mentions it.
-        import_all: import all choices of installed packages, since YAML files of the user may mention them.
+        arguments: command line; a choice whose settings are slow to import is imported if an argument mentions it.
+        load_all: import all of them, since YAML files of the user may mention them.
         scratch: folder for the file that Hydra writes in a multirun whatever its settings say.
 
     Raises:
@@ -68,8 +68,8 @@ def register(command: Command, arguments: Sequence[str], *, import_all: bool, sc
     for field in dataclasses.fields(command.schema):
         store.repo.pop(field.name, None)  # choices of a command that ran before in this process
         for choice in field.metadata.get("registry", ()):
-            mentioned = import_all or any(choice in argument for argument in arguments)
-            store.store(group=field.name, name=choice, node=choice_settings(field, choice, import_package=mentioned))
+            load = load_all or any(choice in argument for argument in arguments)
+            store.store(group=field.name, name=choice, node=choice_settings(field, choice, load=load))
     quiet = {"hydra_logging": "none", "job_logging": "none"}
     defaults = [{**entry, **{key: quiet[key] for key in entry if key in quiet}} for entry in HydraConf().defaults]
     conf = HydraConf(
@@ -88,21 +88,24 @@ def register(command: Command, arguments: Sequence[str], *, import_all: bool, sc
     OmegaConf.register_new_resolver("modgnn_rl_help", show_help, replace=True)
 
 
-def choice_settings(field: dataclasses.Field[Any], choice: str, *, import_package: bool = False) -> Any:
+def choice_settings(field: dataclasses.Field[Any], choice: str, *, load: bool) -> Any:
     """The settings of one choice of a field declared with `modgnn_rl.configs.settings.group`, with their defaults.
 
     Args:
         field: the field.
         choice: a name in its registry.
-        import_package: import the choice of an installed package; otherwise its own settings are not known.
+        load: import what is needed; otherwise the choice of an installed package, or one whose settings are declared
+            beside code that imports torch, appears with the shared settings alone.
 
     Raises:
         InputError: the choice is registered with settings that are not derived from those that all choices share.
     """
     registry: Registry = field.metadata["registry"]
     base: type = field.metadata["base"]
-    entry = registry[choice] if import_package else registry.peek(choice)
-    kind = entry.option("settings", base) if entry else base
+    entry = registry[choice] if load else registry.peek(choice)
+    declared = entry.options.get("settings") if entry else None
+    is_slow = isinstance(declared, Reference) and not declared.is_cheap
+    kind = base if entry is None or (is_slow and not load) else entry.option("settings", base)
     if not (isinstance(kind, type) and issubclass(kind, base)):
         raise InputError(f"{registry.kind} '{choice}' is registered with settings={kind}: expected a {base.__name__}")
     return typing.cast(Any, kind)(name=choice)
@@ -154,7 +157,7 @@ def known_settings(schema: type, prefix: str = "") -> list[str]:
     for field in dataclasses.fields(schema):
         choices = field.metadata.get("registry", ())
         kinds = [hints[field.name], field.default_factory]
-        kinds += [type(choice_settings(field, choice)) for choice in choices]
+        kinds += [type(choice_settings(field, choice, load=False)) for choice in choices]
         names = [prefix + field.name]
         for kind in kinds:
             if dataclasses.is_dataclass(kind):

@@ -20,7 +20,7 @@ from modgnn_rl.cli.command import run_command, settings_given
 from modgnn_rl.cli.tab import completion_script
 from modgnn_rl.configs.settings import group, setting
 from modgnn_rl.errors import InputError
-from modgnn_rl.registry import Registry
+from modgnn_rl.registry import Entry, Reference, Registry
 from modgnn_rl.utils.signals import Stopped
 
 ROOT = Path(__file__).parents[2]
@@ -279,6 +279,21 @@ def test_an_installed_package_is_imported_when_its_choice_is_used(run: Run, monk
     assert not imported
     assert run("trainer=plugged", "trainer.horizon=3").configs == [Toy(trainer=Plugged("plugged", horizon=3))]
     assert imported == ["plugged"]
+    monkeypatch.setenv("COMP_LINE", "toy trainer=plugged trainer.h")
+    assert run("--shell-completion", "query=bash").out.split() == ["trainer.horizon="]
+
+
+def test_settings_declared_beside_slow_code_are_imported_when_their_choice_is_used(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "slow_toy.py").write_text(f"import sys\nSlowConfig = sys.modules[{__name__!r}].Dagger\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    slow = Reference("slow_toy", "SlowConfig")
+    monkeypatch.setitem(TOYS.built_in, "slow", Entry("slow", slow, {"settings": slow}))
+    assert "trainer=bc, dagger*, patient, slow" in " ".join(run("--help").out.split())
+    assert "slow_toy" not in sys.modules
+    assert run("trainer=slow", "trainer.rounds=3").configs == [Toy(trainer=Dagger("slow", rounds=3))]
+    monkeypatch.delitem(sys.modules, "slow_toy")
 
 
 def test_settings_of_a_choice_must_be_derived_from_those_of_its_group(
