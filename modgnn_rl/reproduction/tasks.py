@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 
 from modgnn_rl.errors import one_line
 from modgnn_rl.utils.files import write_atomically
-from modgnn_rl.utils.text import as_span
+from modgnn_rl.utils.text import format_duration
 
 __all__ = ["Cell", "Outcome", "run_cells"]
 
@@ -201,5 +201,5 @@ class _Clock:
     def __str__(self) -> str:
         passed = time.monotonic() - self.begun
         known = self.cost > TELLING * (self.cost + self.left)
-        left = f", about {as_span(passed * self.left / self.cost)} left" if known else ""
+        left = f", about {format_duration(passed * self.left / self.cost)} left" if known else ""
         return f"[{self.number + 1}/{self.total}{left}]"

@@ -12,7 +12,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.tracking.listing import next_steps, state_of
 from modgnn_rl.tracking.reader import EVALUATED, SHARES
 from modgnn_rl.tracking.summary import METRICS, RunSummary
-from modgnn_rl.utils.text import as_figure, as_span, markdown
+from modgnn_rl.utils.text import format_duration, format_value, markdown
 
 __all__ = ["compare", "differing_settings"]
 
@@ -65,16 +65,16 @@ def _training(runs: Sequence[RunSummary]) -> list[list[str]]:
     rows = [
         ["state", *map(state_of, runs)],
         ["started", *(f"{run.started:%Y-%m-%d %H:%M:%S}" if run.started else MISSING for run in runs)],
-        ["trained for", *(as_span(run.seconds) for run in runs)],
+        ["trained for", *(format_duration(run.seconds) for run in runs)],
         ["last round", *map(_round, runs)],
-        ["speed", *(f"{as_figure(run.speed)} {run.unit}/s" if run.speed else MISSING for run in runs)],
+        ["speed", *(f"{format_value(run.speed)} {run.unit}/s" if run.speed else MISSING for run in runs)],
     ]
     for metric in METRICS:
         best = [run.best if run.aim == metric else None for run in runs]
         rows += [
-            [f"{_title(metric)}: last", *(as_figure(run.last.get(metric)) for run in runs)],
-            [f"{_title(metric)}: mean of the last 5", *(as_figure(run.recent.get(metric)) for run in runs)],
-            [f"{_title(metric)}: best mean of 5", *map(as_figure, best)],
+            [f"{_title(metric)}: last", *(format_value(run.last.get(metric)) for run in runs)],
+            [f"{_title(metric)}: mean of the last 5", *(format_value(run.recent.get(metric)) for run in runs)],
+            [f"{_title(metric)}: best mean of 5", *map(format_value, best)],
         ]
     return [row for row in rows if set(row[1:]) != {MISSING}]
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from datetime import datetime
 
 from modgnn_rl.tracking.summary import METRICS, RunSummary
-from modgnn_rl.utils.text import aligned, as_figure, as_span, markdown, printable
+from modgnn_rl.utils.text import aligned, format_duration, format_value, markdown, printable
 
 __all__ = ["list_runs", "next_steps", "sort_key", "state_of"]
 
@@ -108,20 +108,20 @@ def _columns(policies: Collection[object]) -> dict[str, Callable[[RunSummary], s
     return {
         "run": lambda run: f"  {run.path.name}" if run.path in policies else run.name,
         "state": shared(state_of),
-        "age": shared(lambda run: as_span((now - run.updated).total_seconds() if run.updated else None)),
-        "took": shared(lambda run: as_span(run.seconds)),
+        "age": shared(lambda run: format_duration((now - run.updated).total_seconds() if run.updated else None)),
+        "took": shared(lambda run: format_duration(run.seconds)),
         "last": _last_figure,
-        "best": lambda run: as_figure(run.best),
-        "eval.": lambda run: as_figure(_evaluated(run, "error")),
-        "leader": lambda run: as_figure(_evaluated(run, "leader_distance")),
-        "speed": shared(lambda run: f"{as_figure(run.speed)} {run.unit}/s" if run.speed else "-"),
+        "best": lambda run: format_value(run.best),
+        "eval.": lambda run: format_value(_evaluated(run, "error")),
+        "leader": lambda run: format_value(_evaluated(run, "leader_distance")),
+        "speed": shared(lambda run: f"{format_value(run.speed)} {run.unit}/s" if run.speed else "-"),
     }
 
 
 def _last_figure(run: RunSummary) -> str:
     """The last figure of what the trainer aims at, or of what else there is."""
     metric = next((name for name in (run.aim, *METRICS) if name in run.last), None)
-    return "-" if metric is None else f"{LABELS.get(metric, metric)} {as_figure(run.last[metric])}"
+    return "-" if metric is None else f"{LABELS.get(metric, metric)} {format_value(run.last[metric])}"
 
 
 def _evaluated(run: RunSummary, metric: str) -> float | None:

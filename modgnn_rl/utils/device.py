@@ -12,10 +12,10 @@ __all__ = ["prepare_torch"]
 
 
 def prepare_torch(device: str, threads: int) -> None:
-    """Choose the number of threads, keep TorchRL's notices off the terminal, and make sure that the device exists.
+    """Set the number of threads, silence TorchRL's notices, and check that the device works.
 
     Raises:
-        InputError: there is no such device.
+        InputError: the device does not exist or cannot be used.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     if threads:

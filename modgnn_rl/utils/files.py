@@ -1,4 +1,4 @@
-"""Writing files so that a crash leaves the old content or the new, never a part of it."""
+"""Atomic file writes, and checksums."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ __all__ = ["fsync_file", "fsync_folder", "sha256", "write_atomically"]
 
 
 def write_atomically(path: str | os.PathLike[str], data: bytes | str) -> None:
-    """Write a whole file or nothing: whoever opens ``path`` finds the old content or the new.
+    """Write a file atomically: a crash leaves the old content or the new, never a part of it.
 
     Args:
         path: the file to write; its folder must exist.
         data: the new content; text is encoded as UTF-8.
 
     Raises:
-        OSError: the file cannot be written; an older file of that name is then unharmed.
+        OSError: the file cannot be written; an existing file is then unchanged.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -34,7 +34,7 @@ def write_atomically(path: str | os.PathLike[str], data: bytes | str) -> None:
 
 
 def fsync_file(path: str | os.PathLike[str]) -> None:
-    """Return only when the content of a file is on the disk."""
+    """Wait until the content of a file is on disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -42,11 +42,11 @@ def fsync_file(path: str | os.PathLike[str]) -> None:
         os.close(descriptor)
 
 
-# POSIX asks the same of a folder: after a rename its entry is safe once the folder itself is synchronised.
+# POSIX requires the same of a folder: a renamed file is safe once the folder itself is synchronised.
 fsync_folder = fsync_file
 
 
 def sha256(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a file as 64 lower-case hexadecimal digits."""
+    """The SHA-256 of a file as 64 lower-case hexadecimal digits."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -13,11 +13,11 @@ from tqdm import tqdm
 __all__ = ["Progress"]
 
 _LIVE = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}{postfix} [{rate_fmt}, {remaining} left]"
-_PLAIN = "{desc}: {percentage:3.0f}% {n_fmt}/{total_fmt}{postfix} [{rate_fmt}, {elapsed} passed, {remaining} left]"
+_PLAIN = "{desc}: {percentage:3.0f}% {n_fmt}/{total_fmt}{postfix} [{rate_fmt}, {elapsed} elapsed, {remaining} left]"
 
 
 class Progress:
-    """A live bar on a terminal, a plain line now and then elsewhere, and always a last line.
+    """A live bar on a terminal, otherwise a plain line every few seconds, and a final line.
 
     Example::
 
@@ -27,13 +27,13 @@ class Progress:
                 progress.update(4096, round=f"{number + 1}/84", error=error)
 
     Args:
-        description: what is going on, at the start of the line.
-        total: how many units there are to do.
-        unit: what is counted; the rate is given in units per second.
-        done: units that were done before, in work that goes on.
-        every: smallest time between two plain lines, s.
-        stream: where to write; the standard error stream where left out.
-        clock: the time in s, for plain lines.
+        description: name of the work, at the start of the line.
+        total: number of units of work.
+        unit: name of a unit; the rate is in units per second.
+        done: units done before, in resumed work.
+        every: minimum time between plain lines (s).
+        stream: where to write; default: standard error.
+        clock: returns the time (s).
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Progress:
     ) -> None:
         self.description, self.total, self.unit = description, total, f" {unit}"
         self.done = self.initial = done
-        self.figures: dict[str, str] = {}
+        self.values: dict[str, str] = {}
         self._stream = sys.stderr if stream is None else stream
         self._every, self._clock = every, clock
         self._bar: tqdm[Any] | None = None
@@ -71,23 +71,23 @@ class Progress:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Leave the last state on the screen."""
+        """Write the final line."""
         if self._bar is not None:
             self._bar.close()
         else:
             self._write_line()
 
-    def update(self, n: int = 0, **figures: float | str) -> None:
-        """Count ``n`` more units as done, and show these figures from now on.
+    def update(self, n: int = 0, **values: float | str) -> None:
+        """Count ``n`` more units as done, and show these values from now on.
 
         Args:
-            n: how many units were done since the last call.
-            **figures: numbers (shown with three digits) and texts by name; others keep their last value. One that is
-                not known yet, NaN, is not shown.
+            n: units done since the last call.
+            **values: numbers (shown with three digits) and texts by name; those left out keep their last value. NaN,
+                for a value not known yet, is not shown.
         """
         self.done += n
-        self.figures |= {key: value if isinstance(value, str) else f"{value:.3g}" for key, value in figures.items()}
-        self.figures = {key: text for key, text in self.figures.items() if text != "nan"}
+        self.values |= {key: value if isinstance(value, str) else f"{value:.3g}" for key, value in values.items()}
+        self.values = {key: text for key, text in self.values.items() if text != "nan"}
         if self._bar is not None:
             self._bar.set_postfix_str(self._postfix(), refresh=False)
             self._bar.update(n)
@@ -95,7 +95,7 @@ class Progress:
             self._write_line()
 
     def _postfix(self) -> str:
-        return ", ".join(f"{key} {value}" for key, value in self.figures.items())
+        return ", ".join(f"{key} {value}" for key, value in self.values.items())
 
     def _write_line(self) -> None:
         self._last = self._clock()
@@ -110,5 +110,5 @@ class Progress:
             postfix=self._postfix(),
             bar_format=_PLAIN,
         )
-        with contextlib.suppress(OSError):  # a full disk, or a reader that is gone, must not end the work
+        with contextlib.suppress(OSError):  # a full disk or a closed pipe must not end the work
             print(line, file=self._stream, flush=True)

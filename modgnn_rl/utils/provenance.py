@@ -1,4 +1,4 @@
-"""Where a result comes from: commands, versions, hardware, times, commit."""
+"""Provenance of a result: commands, versions, hardware, times, commit."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from modgnn_rl.utils.text import as_span
+from modgnn_rl.utils.text import format_duration
 
 __all__ = ["Provenance", "gather_provenance", "made_with"]
 
-_PACKAGES = ("numpy", "hydra-core", "pybullet", "matplotlib")  # beside those of `made_with`
+_PACKAGES = ("numpy", "hydra-core", "pybullet", "matplotlib")  # besides those of `made_with`
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """What somebody needs to make the same result again.
+    """What is needed to reproduce a result.
 
     Attributes:
         commands: the exact commands, ready to paste.
         versions: version of each package, Python's first.
         hardware: processor, cores, memory, accelerator, system.
-        times: how long each part took, in words, or when it began and ended.
-        commit: of the code, with ``-dirty`` where files differ from it; empty outside of a repository.
+        times: when the work started and finished, and how long its parts took, in words.
+        commit: git commit of the code, with ``-dirty`` if files differ from it; empty outside a repository.
     """
 
     commands: Sequence[str]
@@ -46,16 +46,16 @@ def gather_provenance(
     """Describe this process and this machine; nothing in it names the user or the host.
 
     Args:
-        commands: the exact commands; without any, the command that started this process.
-        started: when the work began, with a time zone; the report then says when, and how long it took.
+        commands: the exact commands; default: the command that started this process.
+        started: start of the work, with a time zone; start and duration are then part of the result.
         times: further times to show, in words, such as ``{"training": "1 h 12 min on two cores"}``.
     """
     now = datetime.now().astimezone()
     about = made_with()
     spans = {"finished": f"{now:%Y-%m-%d %H:%M %Z}"}
     if started is not None:
-        taken = as_span((now - started).total_seconds())
-        spans = {"started": f"{started:%Y-%m-%d %H:%M %Z}", **spans, "taken in all": taken}
+        taken = format_duration((now - started).total_seconds())
+        spans = {"started": f"{started:%Y-%m-%d %H:%M %Z}", **spans, "total": taken}
     return Provenance(
         commands=list(commands) or [_this_command()],
         commit=about.pop("commit", ""),
@@ -66,7 +66,7 @@ def gather_provenance(
 
 
 def made_with() -> dict[str, str]:
-    """Versions of this library and of those that it rests on, and the git commit of its code where there is one."""
+    """Versions of this library and of its main dependencies, and the git commit of its code, if there is one."""
     about = _versions(("modgnn-rl", "torch", "torchrl", "tensordict"))
     folder = Path(__file__).parent
     with contextlib.suppress(OSError, subprocess.SubprocessError):
@@ -79,7 +79,7 @@ def made_with() -> dict[str, str]:
 
 
 def _versions(packages: Sequence[str]) -> dict[str, str]:
-    """Versions of those packages that are installed."""
+    """Versions of the packages that are installed."""
     found = {}
     for name in packages:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -88,7 +88,7 @@ def _versions(packages: Sequence[str]) -> dict[str, str]:
 
 
 def _this_command() -> str:
-    """The command line of this process, whichever way its Python was called."""
+    """The command line of this process, however Python was called."""
     return shlex.join(["python", *sys.orig_argv[1:]])
 
 
@@ -97,7 +97,7 @@ def _hardware() -> dict[str, str]:
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     found = {"processor": _processor(), "cores": f"{usable}, of which torch uses {torch.get_num_threads()}"}
-    with contextlib.suppress(ValueError, OSError, AttributeError):  # a system that does not say
+    with contextlib.suppress(ValueError, OSError, AttributeError):  # not available on this system
         found["memory"] = f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
     devices = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
     found["accelerator"] = ", ".join(devices) or "none"

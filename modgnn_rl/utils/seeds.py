@@ -1,4 +1,4 @@
-"""Independent seeds for everything that is drawn in a run."""
+"""Independent random seeds for each part of a run."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ __all__ = ["derive_seed", "seeded"]
 
 
 def derive_seed(seed: int, *role: str | int) -> int:
-    """A seed for one role in a run, independent of those for other roles and of those of other runs.
+    """Derive the random seed of one part of a run, independent of other parts and other runs.
 
     Args:
         seed: the seed of the run.
-        role: what is drawn with it, for example ``"flocks", 32``.
+        role: what it is for, for example ``"flocks", 32``.
 
     Returns:
-        a seed of 32 bits.
+        a 32-bit seed.
     """
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in role]
     return int(np.random.SeedSequence([seed, *words]).generate_state(1)[0])
@@ -28,13 +28,13 @@ def derive_seed(seed: int, *role: str | int) -> int:
 
 @contextlib.contextmanager
 def seeded(seed: int, device: torch.device | str = "cpu") -> Iterator[None]:
-    """Seed torch's global generators of the CPU and of one device; they are put back at the end.
+    """Seed the global generators of the CPU and of one device, and restore their states at the end.
 
-    For code of others that draws from them: initial weights, distributions.
+    For code that samples from the global generators: initial weights, distributions.
 
     Args:
-        seed: their seed.
-        device: whose generator is seeded beside the CPU's; those of other devices are not touched.
+        seed: seed of both generators.
+        device: device whose generator is seeded besides the CPU's; those of other devices stay as they are.
     """
     device = torch.device(device)
     accelerators = [] if device.type == "cpu" else [device]

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first lets a step of the work end, the second does not."""
+"""Ctrl-C and SIGTERM: the first lets the current step finish, the second ends the process."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stopped(KeyboardInterrupt):
-    """The work was stopped from outside, in good order.
+    """The work was stopped by a signal, after its current step.
 
     Attributes:
-        code: what the process should end with: 128 + the number of the signal, 130 after Ctrl-C, 143 after SIGTERM.
+        code: exit code of the process: 128 + the number of the signal, which is 130 after Ctrl-C and 143 after SIGTERM.
     """
 
     def __init__(self, number: int) -> None:
@@ -27,18 +27,18 @@ class Stopped(KeyboardInterrupt):
 
 
 class GracefulInterrupt:
-    """Turns signals into a question that long work asks itself now and then.
+    """Lets long-running work stop between two steps when a signal arrives.
 
     Example::
 
         with GracefulInterrupt().listen() as interruption:
             with interruption.deferred():
                 for step in range(1000):
-                    ...  # is not torn apart
-                    interruption.check()  # raises Stopped when there was a signal
+                    ...  # is not interrupted
+                    interruption.check()  # raises Stopped if a signal has arrived
 
     Within `deferred` the first signal waits for `check`, and the second ends the process at once, with the same code.
-    Elsewhere a signal raises `Stopped` where it comes. In other threads than the main one nothing is listened to.
+    Elsewhere a signal raises `Stopped` at once. Outside the main thread signals are not handled.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class GracefulInterrupt:
 
     @contextlib.contextmanager
     def listen(self) -> Iterator[GracefulInterrupt]:
-        """Take over the signals; they are given back at the end."""
+        """Handle the signals, and restore the previous handlers at the end."""
         if threading.current_thread() is not threading.main_thread():
             yield self
             return
@@ -61,10 +61,10 @@ class GracefulInterrupt:
 
     @contextlib.contextmanager
     def deferred(self, advice: str = "") -> Iterator[None]:
-        """Let signals wait for `check`.
+        """Defer signals until `check`.
 
         Args:
-            advice: what is printed when one comes.
+            advice: printed when a signal arrives.
         """
         self._defers, self._advice = True, advice
         try:
@@ -73,24 +73,24 @@ class GracefulInterrupt:
             self._defers = False
 
     @property
-    def is_asked_for(self) -> bool:
-        """Whether a signal has come."""
+    def is_requested(self) -> bool:
+        """Whether a signal has arrived."""
         return self._asked is not None
 
     def check(self) -> None:
-        """Stop here if a signal has come.
+        """Stop here if a signal has arrived.
 
         Raises:
-            Stopped: one has.
+            Stopped: a signal has arrived.
         """
         if self._asked is not None:
             raise Stopped(self._asked)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self._asked is not None:
-            os._exit(128 + number)  # whoever asks twice waits for nothing, not even for a server's answer
+            os._exit(128 + number)  # a second signal does not wait for anything, not even for a server
         self._asked = number
         if not self._defers:
             raise Stopped(number)
         if self._advice:
-            os.write(2, f"\n{self._advice}\n".encode())  # print is not safe here: it may have been interrupted itself
+            os.write(2, f"\n{self._advice}\n".encode())  # print may have been interrupted itself, and is not reentrant

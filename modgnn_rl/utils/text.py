@@ -1,14 +1,14 @@
-"""Tables of text, aligned for a terminal or as Markdown, and figures in their cells."""
+"""Text tables, aligned for a terminal or as Markdown, and numbers in their cells."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["aligned", "as_figure", "as_span", "markdown", "printable"]
+__all__ = ["aligned", "format_duration", "format_value", "markdown", "printable"]
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """A table whose columns are kept apart by two spaces; the first row is the header."""
+    """A table with columns separated by two spaces; the first row is the header."""
     return "\n".join("  ".join(cells).rstrip() for cells in _padded(rows))
 
 
@@ -19,13 +19,13 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(lines)
 
 
-def as_figure(value: float | None) -> str:
-    """A number with three digits; ``-`` where there is none."""
+def format_value(value: float | None) -> str:
+    """A number with three significant digits, or ``-`` for None."""
     return "-" if value is None else f"{value:.3g}"
 
 
-def as_span(seconds: float | None) -> str:
-    """A time, s, in the unit that suits it; ``-`` where there is none."""
+def format_duration(seconds: float | None) -> str:
+    """A duration (s) in a suitable unit, or ``-`` for None."""
     if seconds is None:
         return "-"
     for unit, length, most in (("s", 1, 100), ("min", 60, 100), ("h", 3600, 48)):
@@ -35,12 +35,12 @@ def as_span(seconds: float | None) -> str:
 
 
 def printable(text: str) -> str:
-    """Text on one line, without what moves a terminal's cursor."""
+    """Text with control characters, which move the cursor of a terminal, replaced by ``?``."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _padded(rows: Sequence[Sequence[str]]) -> list[list[str]]:
-    """The cells, cleaned, as wide as their columns."""
+    """Printable cells, padded to the width of their columns."""
     clean = [[printable(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*clean, strict=True)]
     return [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in clean]

@@ -23,7 +23,7 @@ def uncompilable(x: Tensor) -> Tensor:
     return x + 1
 
 
-def test_disabled_is_the_function_itself() -> None:
+def test_without_compilation_the_function_is_returned() -> None:
     assert compiled(double_sine, enabled=False) is double_sine
 
 
@@ -38,7 +38,7 @@ def test_compiled_equals_plain_for_every_shape(shapes: int) -> None:
             torch.testing.assert_close(fast(x, 0.5), double_sine(x, 0.5))
 
 
-def test_what_cannot_be_compiled_runs_uncompiled_and_says_so_once() -> None:
+def test_code_that_cannot_be_compiled_runs_uncompiled_with_one_warning() -> None:
     fast = compiled(uncompilable)
     with pytest.warns(UserWarning, match="uncompilable cannot be compiled here and runs uncompiled"):
         assert fast(torch.zeros(2)).tolist() == [1, 1]
@@ -48,7 +48,7 @@ def test_what_cannot_be_compiled_runs_uncompiled_and_says_so_once() -> None:
 
 
 @pytest.mark.skipif(COMPILER is None, reason="torch.compile needs a C++ compiler on the CPU")
-def test_an_error_of_the_arguments_is_no_failure_to_compile() -> None:
+def test_an_error_in_the_arguments_is_not_a_failure_to_compile() -> None:
     fast = compiled(double_sine)
     with pytest.raises(AttributeError):
         fast(None, 1.0)  # type: ignore[arg-type]

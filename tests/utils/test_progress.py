@@ -29,20 +29,20 @@ class Clock:
         return self.now
 
 
-def test_plain_lines_come_seldom_and_say_everything():
+def test_plain_lines_are_rare_and_complete():
     stream, clock = io.StringIO(), Clock()
     with Progress("dagger", 4000, stream=stream, every=10.0, clock=clock) as progress:
         for number in range(1, 31):
             clock.now += 1.0
             progress.update(100, round=f"{number}/40", error=0.12345)
     first, second, third, last = stream.getvalue().splitlines()
-    assert first == "dagger:  25% 1.00k/4.00k, round 10/40, error 0.123 [100 flock-steps/s, 00:10 passed, 00:30 left]"
+    assert first == "dagger:  25% 1.00k/4.00k, round 10/40, error 0.123 [100 flock-steps/s, 00:10 elapsed, 00:30 left]"
     assert "2.00k/4.00k, round 20/40" in second
     assert "3.00k/4.00k, round 30/40" in third
-    assert "00:30 passed, 00:10 left" in last
+    assert "00:30 elapsed, 00:10 left" in last
 
 
-def test_a_short_run_has_its_last_line_only():
+def test_a_short_run_has_a_final_line_only():
     stream = io.StringIO()
     with Progress("evaluate", 10, unit="rollouts", stream=stream, clock=Clock()) as progress:
         progress.update(4, row="expert")
@@ -52,7 +52,7 @@ def test_a_short_run_has_its_last_line_only():
     assert (progress.done, progress.total) == (10, 10)
 
 
-def test_a_figure_that_is_not_known_yet_is_not_shown():
+def test_a_value_that_is_nan_is_not_shown():
     stream = io.StringIO()
     with Progress("dagger", 2, stream=stream, every=0.0, clock=Clock()) as progress:
         progress.update(1, round="0/1", error=math.nan)
@@ -77,7 +77,7 @@ def test_a_terminal_has_one_live_line():
 
 
 @pytest.mark.parametrize("stream", [io.StringIO(), Terminal()])
-def test_an_exception_passes_through_and_the_line_is_ended(stream):
+def test_an_exception_is_passed_on_after_the_final_line(stream):
     def diverge():
         with Progress("dagger", 10, stream=stream) as progress:
             progress.update(1)
@@ -97,7 +97,7 @@ def test_the_standard_error_stream_is_the_default(capsys):
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), BrokenPipeError(32, "Broken pipe")])
-def test_what_cannot_be_written_does_not_end_the_work(error):
+def test_an_unwritable_stream_does_not_end_the_work(error):
     class Full(io.StringIO):
         def write(self, text):
             raise error

@@ -27,8 +27,8 @@ def test_the_command_can_be_pasted_and_nothing_names_the_host(monkeypatch):
     monkeypatch.setattr(sys, "orig_argv", ["/opt/venv/bin/python", "-m", "modgnn_rl.reproduce", "name=a b"])
     found = gather_provenance(started=datetime.now().astimezone() - timedelta(minutes=3), times={"training": "1 min"})
     assert found.commands == ["python -m modgnn_rl.reproduce 'name=a b'"]
-    assert list(found.times) == ["started", "finished", "taken in all", "training"]
-    assert found.times["taken in all"] == "3 min"
+    assert list(found.times) == ["started", "finished", "total", "training"]
+    assert found.times["total"] == "3 min"
     assert next(iter(found.versions)) == "Python"
     assert found.versions["numpy"] == importlib.metadata.version("numpy")
     assert platform.node() not in str(found).split()

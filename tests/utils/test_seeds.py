@@ -11,5 +11,5 @@ def test_seeds_differ_between_roles_and_runs_and_stay_the_same():
     assert derive_seed(0, "env", 1) == derive_seed(0, "env", 1) == 73959161
 
 
-def test_any_seed_from_zero_will_do():
+def test_any_non_negative_seed_works():
     assert 0 <= derive_seed(2**40, "env") < 2**32

@@ -1,4 +1,4 @@
-"""The first signal lets a step end, the second does not."""
+"""The first signal lets a step finish, the second ends the process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_a_signal_waits_for_the_check(number, capfd):
         with GracefulInterrupt().listen() as interruption, interruption.deferred("Stopping soon."):
             os.kill(os.getpid(), number)
             done.append("the step")
-            assert interruption.is_asked_for
+            assert interruption.is_requested
             interruption.check()
             done.append("too much")
 
@@ -35,7 +35,7 @@ def test_a_signal_waits_for_the_check(number, capfd):
 
 
 @pytest.mark.parametrize("number", CODES)
-def test_elsewhere_it_stops_at_once(number):
+def test_a_signal_outside_deferred_stops_at_once(number):
     done = []
 
     def work():
@@ -48,16 +48,16 @@ def test_elsewhere_it_stops_at_once(number):
     assert not done
 
 
-def test_the_handlers_of_before_are_given_back():
+def test_previous_handlers_are_restored():
     before = [signal.getsignal(number) for number in CODES]
     with GracefulInterrupt().listen() as interruption:
         assert signal.getsignal(signal.SIGTERM) != before[1]
-        assert not interruption.is_asked_for
+        assert not interruption.is_requested
         interruption.check()
     assert [signal.getsignal(number) for number in CODES] == before
 
 
-def test_another_thread_listens_to_nothing():
+def test_signals_are_not_handled_outside_the_main_thread():
     before, heard = signal.getsignal(signal.SIGTERM), []
 
     def work():
@@ -71,7 +71,7 @@ def test_another_thread_listens_to_nothing():
 
 
 @pytest.mark.parametrize("number", CODES)
-def test_the_second_ends_the_process_whatever_it_does(number):
+def test_a_second_signal_ends_the_process_at_once(number):
     program = f"""
 import os, time
 from modgnn_rl.utils.signals import GracefulInterrupt

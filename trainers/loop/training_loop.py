@@ -138,7 +138,7 @@ class TrainingLoop:
                 if self.round % BEST_ROUNDS == 0:
                     self._save_best()
                 interrupted, is_due, self._stops = distributed.any_of(
-                    interrupt.is_asked_for, self.checkpointer.is_due, self._stops
+                    interrupt.is_requested, self.checkpointer.is_due, self._stops
                 )
                 if interrupted:
                     self._save(fatal=True)
