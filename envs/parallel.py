@@ -1,13 +1,14 @@
-"""Flocks in several processes, for physics that runs on one core, such as PyBullet's.
+"""Flocks in several worker processes, for physics that uses one core, such as PyBullet's.
 
-TorchRL's parallel environment does the work. Here it is told to build nothing in the parent and to wait without
-spinning; workers end with their parent however that ends, and a worker that dies ends the others with a clear error.
+This is TorchRL's `ParallelEnv`, configured to create no environment in the parent and to wait without busy waiting.
+Workers end with their parent, however the parent ends; if a worker dies, the others are ended and an error names it.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import parent_process
@@ -21,44 +22,48 @@ from torchrl.envs import ParallelEnv
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking.env import FlockingEnv, checked_config
 from modgnn_rl.errors import InputError
+from modgnn_rl.utils.internals import parallel_env_processes
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["ParallelFlocks", "make_flocks", "parallel_flocks"]
+__all__ = ["ParallelFlocks", "make_worker_env", "parallel_flocks"]
+
+TERMINATE_TIMEOUT = 2.0  # s that a terminated worker has to end before it is killed
 
 
 class ParallelFlocks(ParallelEnv):
-    """Environments in processes of their own; see `parallel_flocks`."""
+    """Flocking environments in worker processes; see `parallel_flocks`."""
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        with self._watch():
+        with self._worker_errors():
             return super()._step(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
-        with self._watch():
+        with self._worker_errors():
             return super()._reset(tensordict, **kwargs)
 
     def close(self, **kwargs: Any) -> None:
-        """End the workers."""
+        """Stop the workers."""
         threads = torch.get_num_threads()
-        with self._watch():
+        with self._worker_errors():
             super().close(**kwargs)
-        torch.set_num_threads(threads)  # TorchRL would take as many more as there were workers
+        torch.set_num_threads(threads)  # TorchRL would add one for each worker
 
     @contextmanager
-    def _watch(self) -> Iterator[None]:
-        """End all workers where one has died, which shows as the end of its pipe."""
+    def _worker_errors(self) -> Iterator[None]:
+        """End all workers when one has died, which closes its pipe."""
         try:
             yield
         except (EOFError, OSError) as error:
-            for worker in self._workers:
+            workers = parallel_env_processes(self)
+            for worker in workers:
                 worker.join(0.1)
-            dead = [index for index, worker in enumerate(self._workers) if not worker.is_alive()]
-            self._terminate_and_join_workers(self._workers, timeout=2.0)
+            dead = [index for index, worker in enumerate(workers) if not worker.is_alive()]
+            _end(workers)
             self.is_closed = True
-            codes = ", ".join(f"{index} (exit code {self._workers[index].exitcode})" for index in dead)
+            codes = ", ".join(f"{index} (exit code {workers[index].exitcode})" for index in dead)
             raise RuntimeError(
-                f"of {self.num_workers} processes that fly flocks, these have ended: {codes or 'unknown'}; what they "
-                "said is above; the others have been ended, so build the environment anew"
+                f"of {self.num_workers} worker processes, these have died: {codes or 'unknown'}; their error messages "
+                "are above. The other workers were stopped; create the environment again"
             ) from error
 
 
@@ -73,25 +78,25 @@ def parallel_flocks(
     stagger: bool = False,
     **settings: Any,
 ) -> ParallelFlocks:
-    """Fly flocks in several processes at once: one environment with a batch of ``[workers, num_envs]`` flocks.
+    """Create one environment with a batch of ``[workers, num_envs]`` flocks, stepped in parallel in worker processes.
 
-    The processes are started anew (spawned), so a script that calls this does so under
-    ``if __name__ == "__main__":``. Each has one thread, and the parent holds no environment of its own. They end when
-    the environment is closed and when the parent ends, however it ends; Ctrl-C is left to the parent.
+    Workers are spawned, so a script must call this under ``if __name__ == "__main__":``. Each worker uses one thread,
+    and the parent holds no environment. Workers end when the environment is closed and when the parent ends, however it
+    ends; they ignore Ctrl-C, which the parent handles.
 
     Args:
-        workers: number of processes; as many as there are cores.
-        num_envs: flocks in each of them.
+        workers: number of worker processes, at best one per core.
+        num_envs: flocks in each worker.
         num_agents: agents in each flock, see `modgnn_rl.envs.flocking.env.FlockingEnv`; default: the configuration's.
-        config: settings of the world; default: ``FlockingConfig(**settings)``.
-        seed: seed from which each process derives its own; equal seeds give equal rollouts, bit for bit.
-        dtype: floating-point type of the physics and of everything emitted.
+        config: settings of the environment; default: ``FlockingConfig(**settings)``.
+        seed: seed from which each worker's seed is derived; equal seeds give equal rollouts, bit for bit.
+        dtype: floating-point type of the physics and of all outputs.
         stagger: see `modgnn_rl.envs.flocking.env.FlockingEnv`.
-        settings: fields of `FlockingConfig`, when no ``config`` is given.
+        settings: fields of `FlockingConfig`, if no ``config`` is given.
 
     Raises:
-        InputError: on a setting out of range.
-        RuntimeError: when a worker fails, now or later.
+        InputError: a setting is out of range.
+        RuntimeError: a worker fails, now or later.
     """
     if not isinstance(workers, int) or workers < 1:
         raise InputError(f"workers={workers!r} is not a positive integer")
@@ -105,7 +110,7 @@ def parallel_flocks(
     seeds = [None if seed is None else derive_seed(seed, "worker", index) for index in range(workers)]
     return ParallelFlocks(
         workers,
-        make_flocks,
+        make_worker_env,
         create_env_kwargs=[{**common, "seed": own} for own in seeds],
         num_threads=torch.get_num_threads(),
         mp_start_method="spawn",
@@ -115,15 +120,27 @@ def parallel_flocks(
     )
 
 
-def make_flocks(**kwargs: Any) -> FlockingEnv:
-    """The environment of a worker, in its process: Ctrl-C is left to the parent, and the process ends with it."""
+def _end(workers: Sequence[Any]) -> None:
+    """End processes, by force if they do not react."""
+    for worker in workers:
+        worker.terminate()
+    deadline = time.monotonic() + TERMINATE_TIMEOUT
+    for worker in workers:
+        worker.join(max(0.0, deadline - time.monotonic()))
+        if worker.is_alive():
+            worker.kill()
+            worker.join()
+
+
+def make_worker_env(**kwargs: Any) -> FlockingEnv:
+    """Create the environment of a worker, in its process, which ignores Ctrl-C and ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
     return FlockingEnv(**kwargs)
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has gone, whatever it is doing."""
+    """End this process when its parent ends, whatever it is doing."""
     parent = parent_process()
     if parent is not None:
         parent.join()

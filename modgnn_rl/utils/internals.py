@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from typing import Any
 
-__all__ = ["parse_hydra_flags"]
+__all__ = ["parallel_env_processes", "parse_hydra_flags"]
 
 
 def parse_hydra_flags(arguments: Sequence[str]) -> argparse.Namespace:
@@ -30,3 +31,12 @@ def parse_hydra_flags(arguments: Sequence[str]) -> argparse.Namespace:
     from hydra._internal.utils import get_args_parser
 
     return get_args_parser().parse_args(list(arguments))
+
+
+def parallel_env_processes(env: Any) -> list[Any]:
+    """The worker processes of a TorchRL `ParallelEnv`, by worker index, as `multiprocessing.Process` objects.
+
+    `ParallelEnv` keeps them private. They are needed to name a worker that has died, with its exit code, and to end the
+    others at once: `ParallelEnv.close` waits for workers that are busy.
+    """
+    return list(env._workers)

@@ -1,4 +1,4 @@
-"""Flocks in worker processes: the rollouts are those of one process, and nothing outlives its parent or hangs."""
+"""Flocks in worker processes: rollouts equal those of one process, and no worker hangs or outlives its parent."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.parallel import ParallelFlocks, parallel_flocks
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.factory import make_model
+from modgnn_rl.utils.internals import parallel_env_processes
 from modgnn_rl.utils.seeds import derive_seed
 
 WORKERS, FLOCKS, AGENTS = 2, 2, 3
@@ -26,13 +27,14 @@ SCRIPT = """
 import sys, time
 import torch
 from modgnn_rl.envs.parallel import parallel_flocks
+from modgnn_rl.utils.internals import parallel_env_processes
 if __name__ == "__main__":
     env = parallel_flocks(1, 1, 2, seed=0, physics=sys.argv[1])
     state = env.reset()
-    print(*(worker.pid for worker in env._workers), flush=True)
+    print(*(worker.pid for worker in parallel_env_processes(env)), flush=True)
     if sys.argv[2] == "sleep":
         time.sleep(600)
-    if sys.argv[2] == "fly":
+    if sys.argv[2] == "rollout":
         env.rollout(10**6, auto_reset=False, tensordict=state, break_when_any_done=False)
 """
 
@@ -44,7 +46,7 @@ def env() -> Iterator[ParallelFlocks]:
     env.close(raise_if_closed=False)
 
 
-def test_flights_are_those_of_one_process(env: ParallelFlocks) -> None:
+def test_rollouts_equal_those_of_one_process(env: ParallelFlocks) -> None:
     assert env.batch_size == (WORKERS, FLOCKS)
     action = torch.randn(WORKERS, FLOCKS, AGENTS, 3, generator=torch.Generator().manual_seed(0))
     alone = [FlockingEnv(FLOCKS, AGENTS, seed=derive_seed(1, "worker", index), physics="bullet") for index in (0, 1)]
@@ -59,7 +61,7 @@ def test_flights_are_those_of_one_process(env: ParallelFlocks) -> None:
     assert not torch.equal(states[1]["agents", "observation"], states[2]["agents", "observation"])
 
 
-def test_policy_with_memory_flies_them(env: ParallelFlocks) -> None:
+def test_recurrent_policies_roll_out(env: ParallelFlocks) -> None:
     policy = make_model("modgnn_mlp", seed=0)
 
     def rollout(flocks: EnvBase) -> TensorDictBase:
@@ -79,10 +81,10 @@ def test_policy_with_memory_flies_them(env: ParallelFlocks) -> None:
         )
 
 
-def test_death_of_a_worker_is_an_error_that_ends_all(env: ParallelFlocks) -> None:
-    """The last test of this environment."""
+def test_the_death_of_a_worker_is_an_error_and_ends_the_others(env: ParallelFlocks) -> None:
+    """The last test that uses this environment."""
     state = env.reset()
-    workers = env._workers
+    workers = parallel_env_processes(env)
     os.kill(workers[1].pid, signal.SIGKILL)
     state["agents", "action"] = torch.zeros(WORKERS, FLOCKS, AGENTS, 3)
     with pytest.raises(RuntimeError, match=r"1 \(exit code -9\)"):
@@ -90,7 +92,7 @@ def test_death_of_a_worker_is_an_error_that_ends_all(env: ParallelFlocks) -> Non
     assert not any(worker.is_alive() for worker in workers)
 
 
-def test_bad_settings_are_refused_at_once() -> None:
+def test_bad_settings_are_errors_in_the_parent() -> None:
     with pytest.raises(InputError, match="workers=0"):
         parallel_flocks(0, 1)
     with pytest.raises(InputError, match="comm_range"):
@@ -98,8 +100,8 @@ def test_bad_settings_are_refused_at_once() -> None:
 
 
 def start(tmp_path: Path, *arguments: str) -> tuple[subprocess.Popen[str], list[int]]:
-    """A process with a worker, in a process group of its own, and the worker."""
-    script = tmp_path / "fly.py"
+    """Start a process with a worker, in its own process group; returns it and the PIDs of its workers."""
+    script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     parent = subprocess.Popen(
         [sys.executable, str(script), *arguments],
@@ -113,7 +115,7 @@ def start(tmp_path: Path, *arguments: str) -> tuple[subprocess.Popen[str], list[
 
 
 def have_ended(processes: list[int], within: float = 20.0) -> bool:
-    """Whether none of the processes runs any more."""
+    """Whether no process is running any more."""
     end = time.monotonic() + within
     while any(is_running(process) for process in processes):
         if time.monotonic() > end:
@@ -123,7 +125,7 @@ def have_ended(processes: list[int], within: float = 20.0) -> bool:
 
 
 def is_running(process: int) -> bool:
-    """Whether a process is there, and not only waits for somebody to read its exit code."""
+    """Whether a process exists and is not a zombie."""
     listing = subprocess.run(["ps", "-o", "stat=", "-p", str(process)], capture_output=True, text=True)
     return listing.stdout.strip()[:1] not in ("", "Z")
 
@@ -138,8 +140,8 @@ def test_workers_end_when_the_parent_is_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_workers_end_when_the_parent_is_killed_in_flight(tmp_path: Path) -> None:
-    parent, workers = start(tmp_path, "bullet", "fly")
+def test_workers_end_when_the_parent_is_killed_during_a_rollout(tmp_path: Path) -> None:
+    parent, workers = start(tmp_path, "bullet", "rollout")
     time.sleep(1)
     parent.kill()
     assert have_ended(workers)
@@ -148,7 +150,7 @@ def test_workers_end_when_the_parent_is_killed_in_flight(tmp_path: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("activity", ["sleep", "rollout"])
-def test_interrupt_ends_all_and_only_the_parent_speaks(tmp_path: Path, activity: str) -> None:
+def test_an_interrupt_ends_all_and_only_the_parent_reports_it(tmp_path: Path, activity: str) -> None:
     parent, workers = start(tmp_path, "bullet", activity)
     time.sleep(1)
     os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
@@ -158,7 +160,7 @@ def test_interrupt_ends_all_and_only_the_parent_speaks(tmp_path: Path, activity:
 
 
 @pytest.mark.slow
-def test_workers_end_with_a_parent_that_forgets_to_close(tmp_path: Path) -> None:
+def test_workers_end_with_a_parent_that_does_not_close(tmp_path: Path) -> None:
     parent, workers = start(tmp_path, "bullet", "nothing")
     parent.communicate(timeout=60)
     assert parent.returncode == 0

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from modgnn_rl.utils.internals import parse_hydra_flags
+from modgnn_rl.envs.parallel import parallel_flocks
+from modgnn_rl.utils.internals import parallel_env_processes, parse_hydra_flags
 
 
 def test_hydra_flags_have_the_fields_that_the_command_line_reads() -> None:
@@ -20,3 +21,12 @@ def test_an_unknown_hydra_flag_is_named_after_the_usage(capsys: pytest.CaptureFi
     with pytest.raises(SystemExit):
         parse_hydra_flags(["--colour"])
     assert capsys.readouterr().err.rpartition("error: ")[2] == "unrecognized arguments: --colour\n"
+
+
+def test_processes_of_a_parallel_env_are_listed_by_worker_index() -> None:
+    """Else: `modgnn_rl.envs.parallel` can neither name a dead worker nor end the others at once."""
+    env = parallel_flocks(2, 1, 2, seed=0)
+    processes = parallel_env_processes(env)
+    assert [process.is_alive() for process in processes] == [True, True]
+    env.close()
+    assert [process.is_alive() for process in processes] == [False, False]

@@ -627,9 +627,9 @@ def test_the_environment_does_not_move() -> None:
         env.to("meta")
 
 
-def test_the_current_device_of_its_kind_is_no_other_device() -> None:
+def test_a_device_without_index_is_the_current_one(monkeypatch: pytest.MonkeyPatch) -> None:
     env = FlockingEnv(1, 2)
-    env._device = torch.device("cuda:0")  # what TorchRL makes of "cuda"
+    monkeypatch.setattr(FlockingEnv, "device", torch.device("cuda:0"))  # what TorchRL makes of "cuda"
     assert env.to("cuda") is env
     assert env.to("cuda:0") is env
     with pytest.raises(InputError, match="is on cuda:0"):
