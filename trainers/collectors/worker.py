@@ -20,7 +20,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.parallel import make_flocks
+from modgnn_rl.envs.parallel import make_worker_env
 from modgnn_rl.errors import InputError
 from modgnn_rl.trainers.collectors.behaviour import BetaMixture
 from modgnn_rl.utils.seeds import derive_seed
@@ -50,7 +50,7 @@ class WorkerSpec:
         logging.getLogger("torchrl").setLevel(logging.WARNING)
         torch.set_num_threads(1)
         torch.manual_seed(self.seed)
-        return make_flocks(
+        return make_worker_env(
             num_envs=self.num_envs,
             num_agents=self.num_agents,
             config=self.config,
