@@ -51,7 +51,14 @@ def check_bc(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDict
         )
 
 
-@TRAINERS.register("bc", settings=BCConfig, objective="validation_loss", members=member_configs, check=check_bc)
+@TRAINERS.register(
+    "bc",
+    settings=BCConfig,
+    objective="validation_loss",
+    members=member_configs,
+    check=check_bc,
+    fixed=("models", "hops", "seeds"),
+)
 def bc(context: TrainContext) -> dict[str, ModGNN]:
     """Train policies by behaviour cloning, one or several side by side on the same batches.
 

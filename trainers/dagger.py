@@ -42,7 +42,14 @@ def check_dagger(config: TrainConfig, policies: Sequence[ModGNN], expert: Tensor
     check_steps(config, "steps_per_round", window_of(policies, config.trainer))
 
 
-@TRAINERS.register("dagger", settings=DAggerConfig, objective="error", members=ensemble_configs, check=check_dagger)
+@TRAINERS.register(
+    "dagger",
+    settings=DAggerConfig,
+    objective="error",
+    members=ensemble_configs,
+    check=check_dagger,
+    fixed=("gate", "ensemble"),
+)
 def dagger(context: TrainContext) -> dict[str, ModGNN]:
     """Train a policy with DAgger.
 

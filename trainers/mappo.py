@@ -26,7 +26,7 @@ def check_mappo(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorD
     check_steps(config, "steps_per_round", ppo_window(policies[0], config.trainer)[1])
 
 
-@TRAINERS.register("mappo", settings=MAPPOConfig, objective="reward", check=check_mappo)
+@TRAINERS.register("mappo", settings=MAPPOConfig, objective="reward", check=check_mappo, fixed=("critic_hidden",))
 def mappo(context: TrainContext) -> dict[str, ModGNN]:
     """Improve a policy with MAPPO, from a pretrained policy (``config.init_from``) or from scratch.
 

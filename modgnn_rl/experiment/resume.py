@@ -1,4 +1,4 @@
-"""What a run may change when it goes on: the settings of before, with changes, and what these cost."""
+"""Settings of a resumed run: those it was started with, changes to them, and what these changes affect."""
 
 from __future__ import annotations
 
@@ -24,23 +24,10 @@ __all__ = [
     "with_stored_trainer",
 ]
 
-# What the weights, or what has been drawn, were made for.
-FIXED = (
-    "model",
-    "trainer.name",
-    "trainer.models",
-    "trainer.hops",
-    "trainer.seeds",
-    "trainer.gate",
-    "trainer.ensemble",
-    "trainer.critic_hidden",
-    "init_from",
-    "seed",
-    "runs",
-    "name",
-)
-# What rollouts and data were made for: with another of these, flocks begin anew, with no data.
-FLOWN = (
+# Settings that cannot change once a run has started, beside those of the trainer's own option `fixed`.
+FIXED = ("model", "trainer.name", "init_from", "seed", "runs", "name")
+# If one of these changes, environments and training data start afresh.
+RESTARTING = (
     "env",
     "device",
     "collector",
@@ -51,14 +38,14 @@ FLOWN = (
     "trainer.replacement",
     "trainer.hide_velocity",
 )
-NOT_FLOWN = ("env.on_nonfinite", "collector.timeout", "collector.ray_address")
+NOT_RESTARTING = ("env.on_nonfinite", "collector.timeout", "collector.ray_address")
 
 
 def stored_config(run: RunFolder) -> TrainConfig:
     """The settings of a training run.
 
     Raises:
-        InputError: they are not as this version writes them.
+        InputError: they are not as this version writes them, or the trainer is unknown.
     """
     try:
         trainer = TRAINERS[run.config["trainer"]["name"]].option("settings")()
@@ -67,7 +54,7 @@ def stored_config(run: RunFolder) -> TrainConfig:
     except (InputError, KeyError, TypeError, OmegaConfBaseException) as error:
         raise InputError(
             f"{run.path / 'config.yaml'} is not as this version writes it ({str(error).splitlines()[0]}): resume the "
-            "run with the version that began it"
+            "run with the version that started it"
         ) from error
 
 
@@ -77,7 +64,7 @@ def changed_config(old: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     Args:
         old: the settings.
         changes: new values by dotted names, as in ``{"trainer.rounds": 160, "logger": "csv"}``; of a trainer or a
-            model only the name counts.
+            model only the name is used.
 
     Raises:
         InputError: there is no such setting, or it cannot have that value.
@@ -96,35 +83,36 @@ def differences(old: TrainConfig, new: TrainConfig) -> dict[str, tuple[Any, Any]
     """The settings that differ, by their dotted names: old and new value.
 
     Raises:
-        InputError: a run that has begun cannot change one of these.
+        InputError: one of them cannot change in a run that has started.
     """
     before, after = (flat(cast(Any, OmegaConf.to_container(OmegaConf.structured(config)))) for config in (old, new))
     found = {key: (before.get(key), value) for key, value in after.items() if before.get(key) != value}
-    fixed = [f"{key} from {was} to {value}" for key, (was, value) in found.items() if _is_among(key, FIXED)]
+    own = [f"trainer.{name}" for name in TRAINERS[old.trainer.name].option("fixed", ())]
+    fixed = [f"{key} from {was} to {value}" for key, (was, value) in found.items() if _is_among(key, [*FIXED, *own])]
     if fixed:
         raise InputError(
-            f"a run that has begun cannot change {', '.join(fixed)}; leave that out, or begin another run, with "
-            "init_from= where its policy should be that of this one"
+            f"a run that has started cannot change {', '.join(fixed)}; leave that out, or start a new run, with "
+            "init_from= to start from this run's policy"
         )
     return found
 
 
 def requires_restart(changed: Mapping[str, tuple[Any, Any]]) -> list[str]:
-    """Those of the changed settings with which flocks begin anew, as ``name=value``."""
+    """The changed settings because of which environments and data start afresh, as ``name=value``."""
     return [
         f"{key}={value}"
         for key, (_, value) in changed.items()
-        if _is_among(key, FLOWN) and not _is_among(key, NOT_FLOWN)
+        if _is_among(key, RESTARTING) and not _is_among(key, NOT_RESTARTING)
     ]
 
 
 def with_stored_trainer(arguments: Sequence[str]) -> list[str]:
-    """A command line that names the trainer of the run that it resumes, so that settings of that trainer are known."""
+    """The arguments of a command line, with the trainer of the run that it resumes, whose settings are then known."""
     named = list(arguments)
     if not any(argument.startswith("trainer=") for argument in arguments):
         for index, argument in enumerate(arguments):
             if argument.startswith("resume="):
-                # What is wrong with a folder is said later, where the run is opened.
+                # Errors of the folder are reported later, where the run is opened.
                 with contextlib.suppress(InputError, KeyError, TypeError):
                     trainer = RunFolder.open(Path(argument.partition("=")[2])).config["trainer"]["name"]
                     named.insert(index + 1, f"trainer={trainer}")

@@ -6,7 +6,7 @@ import contextlib
 import os
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import one_line
 from modgnn_rl.experiment.evaluate import evaluate_policies
 from modgnn_rl.experiment.resume import changed_config, differences, requires_restart, stored_config
+from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
 from modgnn_rl.tracking.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.tracking.loggers import LoggerGroup, check_logger, make_logger
@@ -43,26 +44,29 @@ def train(
 ) -> RunFolder:
     """Train a policy, evaluate it, and leave everything in a new run folder.
 
-    Ctrl-C and SIGTERM let the round end, write a checkpoint and raise `modgnn_rl.utils.signals.Stopped`; `resume` goes
-    on from there, or from the last checkpoint before whatever else ended the run. In processes that ``torchrun`` has
-    started, all train together; the first alone writes into the folder and evaluates.
+    Ctrl-C and SIGTERM let the current round end, write a checkpoint and raise `modgnn_rl.utils.signals.Stopped`.
+    `resume` continues from there, or, whatever else ended the run, from the last checkpoint. Processes started by
+    ``torchrun`` train together; only the first one writes into the folder and evaluates.
 
     Args:
-        config: all settings.
-        expert: whom to learn from: any TensorDictModule that reads the environment's keys and writes
-            ``("agents", "expert_action")``; default: Reynolds flocking. Errors in the evaluation are against it too.
-        callbacks: people's own code, see `modgnn_rl.trainers.loop.callbacks`.
+        config: all settings. They are checked here, before anything is created; trainers rely on that.
+        expert: the policy to imitate, and to measure errors against: any TensorDictModule that reads the environment's
+            keys and writes ``("agents", "expert_action")``. Default: Reynolds flocking.
+        callbacks: your own code, see `modgnn_rl.trainers.loop.callbacks`.
         evaluate: whether to evaluate the policies at the end.
 
+    Returns:
+        the run folder.
+
     Raises:
-        InputError: a bad setting, or a device or a logger that this machine does not have; nothing is created then.
+        InputError: an invalid setting, or a device or logger that this machine does not have; nothing is created then.
     """
     config = _checked(config, expert)
     with distributed.process_group(config.device):
         run = _new_run(config)
         with _lock(run):
             distributed.print_rank0(f"Training in {run.path}")
-            return _work(config, run, expert, callbacks, evaluate=evaluate)
+            return _run(config, run, expert, callbacks, evaluate=evaluate)
 
 
 def resume(
@@ -73,22 +77,25 @@ def resume(
     callbacks: Sequence[Callback] = (),
     evaluate: bool = True,
 ) -> RunFolder:
-    """Go on with a run that was stopped, killed, or ended, from its last checkpoint.
+    """Resume a run that was stopped, was killed, or has ended, from its last checkpoint.
 
-    On the CPU, with one thread and the settings unchanged, it ends with the weights, metrics and data with which it
-    would have ended had it never stopped.
+    On the CPU, with one thread and unchanged settings, it ends with the same weights, metrics and data as an
+    uninterrupted run.
 
     Args:
         folder: the run folder.
         changes: new values of settings by their dotted names, as in ``{"trainer.rounds": 160, "logger": "csv"}``. The
-            model, the trainer and the seed cannot change. In another world, or with another number of agents, flocks
-            begin anew, with no data.
+            model, the trainer and the seed cannot change. With another environment, or another number of agents,
+            environments and training data start afresh.
         expert: as `train` was given it.
-        callbacks: as `train` was given them; they begin with what checkpoints hold of them.
+        callbacks: as `train` was given them; their state is restored from the checkpoint.
         evaluate: whether to evaluate the policies at the end.
 
+    Returns:
+        the run folder.
+
     Raises:
-        InputError: no run, no readable checkpoint, a change that cannot be, or a run that goes on elsewhere.
+        InputError: no run, no readable checkpoint, a change that is not possible, or a run that is training elsewhere.
     """
     run = RunFolder.open(folder)
     old = stored_config(run)
@@ -97,22 +104,27 @@ def resume(
     config = _checked(config, expert)
     with distributed.process_group(config.device), _lock(run):
         checkpoint = load_checkpoint(run.checkpoints) if has_checkpoint(run.checkpoints) else None
-        anew = requires_restart(changed)
+        restarts = requires_restart(changed)
         if changed and distributed.is_first():
             run = run.with_config(OmegaConf.to_yaml(OmegaConf.structured(config)))
-        where = "its start, for it has no checkpoint yet" if checkpoint is None else f"round {checkpoint.step}"
-        distributed.print_rank0(f"Resuming {run.path} from {where}")
-        if anew and checkpoint is not None:
-            distributed.print_rank0(f"Flocks begin anew, with no data, because of {', '.join(anew)}")
-        elif distributed.size() > 1 and checkpoint is not None:
-            distributed.print_rank0(
-                "Flocks begin anew, with no data, in all processes but the first, whose flocks are kept"
-            )
-        return _work(config, run, expert, callbacks, checkpoint, restore_rollouts=not anew, evaluate=evaluate)
+        _announce(run, checkpoint, restarts)
+        return _run(config, run, expert, callbacks, checkpoint, restore_rollouts=not restarts, evaluate=evaluate)
+
+
+def _announce(run: RunFolder, checkpoint: Checkpoint | None, restarts: Sequence[str]) -> None:
+    """Print where a run resumes from, and which of its environments start afresh."""
+    if checkpoint is None:
+        distributed.print_rank0(f"Resuming {run.path} from its start: it has no checkpoint yet")
+        return
+    distributed.print_rank0(f"Resuming {run.path} from round {checkpoint.step}")
+    if restarts:
+        distributed.print_rank0(f"Environments and training data start afresh because of {', '.join(restarts)}")
+    elif distributed.size() > 1:
+        distributed.print_rank0("Environments and training data start afresh in all processes but the first")
 
 
 def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainConfig:
-    """The settings of a run, with the model settled, after everything that can be refused has been looked at."""
+    """The settings of a run with the model resolved, after all checks that need no run folder."""
     check(config)
     prepare_torch(distributed.own_device(config.device), config.threads)
     check_logger(config)
@@ -122,7 +134,7 @@ def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainC
 
 
 def _new_run(config: TrainConfig) -> RunFolder:
-    """A new folder that the first process makes; others learn where it is."""
+    """The new run folder, which the first process makes and the others are told of."""
     if not distributed.is_first():
         return RunFolder(Path(distributed.texts("")[0]), {})
     name = config.name or f"{config.trainer.name}-{config.model.name}"
@@ -136,7 +148,7 @@ def _lock(run: RunFolder) -> contextlib.AbstractContextManager[None]:
     return run.lock() if distributed.is_first() else contextlib.nullcontext()
 
 
-def _work(
+def _run(
     config: TrainConfig,
     run: RunFolder,
     expert: TensorDictModuleBase | None,
@@ -146,14 +158,12 @@ def _work(
     restore_rollouts: bool = True,
     evaluate: bool,
 ) -> RunFolder:
-    """Train from the beginning or from a checkpoint, then evaluate, which the first process does alone."""
+    """Train, from the start or from a checkpoint, and evaluate, which the first process does alone."""
     first = distributed.is_first()
-    loggers = make_logger(config, run) if first else LoggerGroup({})
-    dashboards = [DashboardCallback(config, run, loggers, expert)] if loggers else []
-    with GracefulInterrupt().listen() as interrupt:
-        own = distributed.own_part(config, checkpoint.step if checkpoint else 0)
+    with GracefulInterrupt().listen() as interrupt, _loggers(config, run) as loggers, _status_of_failure(run):
+        dashboards = [DashboardCallback(config, run, loggers, expert)] if loggers else []
         context = TrainContext(
-            config=own,
+            config=distributed.own_part(config, checkpoint.step if checkpoint else 0),
             expert=Reynolds.for_env(config.env) if expert is None else expert,
             run=run,
             loggers=loggers,
@@ -162,33 +172,52 @@ def _work(
             restore_rollouts=restore_rollouts and first,
             interrupt=interrupt,
         )
-        try:
-            policies = TRAINERS[config.trainer.name].load()(context)
-            distributed.leave()
-            if not first:
-                return run
-            if evaluate:
-                run.note_status("evaluating")
-                sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
-                env_config, settings, device = config.env, config.evaluation, own.device
-                tables = evaluate_policies(run, policies, env_config, settings, sizes, device, expert=expert)
-                log_evaluation(loggers, tables)
+        policies = TRAINERS[config.trainer.name].load()(context)
+        distributed.leave()
+        if first and evaluate:
+            _evaluate(config, run, policies, loggers, context.config.device, expert)
+        if first:
             run.note_status("finished")
-        except BaseException as error:
-            if first:
-                _note_end(run, error)
-            raise
-        finally:
-            for where in loggers.close():
-                print(where)
     return run
 
 
-def _note_end(run: RunFolder, error: BaseException) -> None:
-    """Say in the run folder, and where it was asked for on the terminal, that a run has ended before its time."""
-    stopped = isinstance(error, KeyboardInterrupt)
-    with contextlib.suppress(OSError):
-        run.note_status("stopped" if stopped else "failed", reason=one_line(error))
-    if stopped:
-        resuming = shlex.quote(f"resume={run.path}")
-        print(f"Stopped; to go on: python -m modgnn_rl.train {resuming}", file=sys.stderr, flush=True)
+def _evaluate(
+    config: TrainConfig,
+    run: RunFolder,
+    policies: Mapping[str, ModGNN],
+    loggers: LoggerGroup,
+    device: str,
+    expert: TensorDictModuleBase | None,
+) -> None:
+    """Evaluate the policies, and show the tables on dashboards."""
+    run.note_status("evaluating")
+    sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
+    tables = evaluate_policies(run, policies, config.env, config.evaluation, sizes, device, expert=expert)
+    log_evaluation(loggers, tables)
+
+
+@contextlib.contextmanager
+def _loggers(config: TrainConfig, run: RunFolder) -> Iterator[LoggerGroup]:
+    """The loggers of the first process; at the end they are closed, and it is printed where they have written."""
+    loggers = make_logger(config, run) if distributed.is_first() else LoggerGroup({})
+    try:
+        yield loggers
+    finally:
+        for line in loggers.close():
+            print(line)
+
+
+@contextlib.contextmanager
+def _status_of_failure(run: RunFolder) -> Iterator[None]:
+    """Write into the run folder why a run has failed or was stopped; after Ctrl-C, print how to resume it, too."""
+    try:
+        yield
+    except BaseException as error:
+        if distributed.is_first():
+            stopped = isinstance(error, KeyboardInterrupt)
+            with contextlib.suppress(OSError):
+                run.note_status("stopped" if stopped else "failed", reason=one_line(error))
+            if stopped:
+                arguments = shlex.quote(f"resume={run.path}")
+                print(f"Stopped. To resume: python -m modgnn_rl.train {arguments}", file=sys.stderr, flush=True)
+        raise

@@ -139,7 +139,7 @@ def test_flocks_or_data_that_begin_anew(tmp_path, capsys, how):
     run = _stop(tmp_path, trainer=DAggerConfig(**DAGGER, checkpoint_data=kept))
     before = load_policy(run.path).state_dict()
     resume(run.path, {"env.num_agents": [3, 5]} if kept else {}, evaluate=False)
-    assert ("begin anew, with no data, because of env.num_agents=[3, 5]" in capsys.readouterr().out) == kept
+    assert ("start afresh because of env.num_agents=[3, 5]" in capsys.readouterr().out) == kept
     assert [line["step"] for line in run.read_metrics()] == [0, 1, 2, 3, 4]
     assert any(not torch.equal(value, before[name]) for name, value in load_policy(run.path).state_dict().items())
 

@@ -206,11 +206,11 @@ def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, arguments, words):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["env.num_agents=[4,4]"], "must name each size once"),
+        (["env.num_agents=[4,4]"], "must list each size once"),
         (["env.start_distance=9"], "do not fit into a ball"),
         (["model.hops=0"], "has nothing to learn"),
         (["device=tpu9"], "device=tpu9"),
-        (["trainer.updates_per_round=1", "env.num_agents=[4,5]"], "too few for 2 sizes"),
+        (["trainer.updates_per_round=1", "env.num_agents=[4,5]"], "too few for 2 flock sizes"),
     ],
 )
 def test_a_mistake_that_training_finds_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capsys, arguments, words):

@@ -135,10 +135,10 @@ def test_it_flies_in_every_world(tmp_path, env, model):
         ({"init_from": "."}, "is no run folder"),
         ({"init_from": "nowhere"}, "is no run folder"),
         ({"model": ModelConfig(name="gcn")}, r"name='gcn'.* is not that of init_from=.*name='modgnn_mlp', hops=2"),
-        ({"trainer": BCConfig(seeds=2)}, "several policies cannot all begin with that of init_from"),
-        ({"trainer": BCConfig(models=["gcn"])}, "trainer.models and trainer.hops name fresh policies"),
-        ({"trainer": BCConfig(hops=[1])}, "trainer.models and trainer.hops name fresh policies"),
-        ({"trainer": DAggerConfig(gate="ensemble")}, "several policies cannot all begin with that of init_from"),
+        ({"trainer": BCConfig(seeds=2)}, "several policies cannot all start from that of init_from"),
+        ({"trainer": BCConfig(models=["gcn"])}, "trainer.models and trainer.hops name new policies"),
+        ({"trainer": BCConfig(hops=[1])}, "trainer.models and trainer.hops name new policies"),
+        ({"trainer": DAggerConfig(gate="ensemble")}, "several policies cannot all start from that of init_from"),
     ],
 )
 def test_a_beginning_that_cannot_be_is_refused_before_anything_is_created(

@@ -1,7 +1,7 @@
-"""Several processes that train one policy, as ``torchrun`` starts them: each flies flocks of its own, all step alike.
+"""Distributed training: several processes, started by ``torchrun``, train one policy.
 
-Whoever trains in one process need not know of this: all functions are then about that one process alone.
-Processes are numbered from 0. The first writes, prints and evaluates; the others fly and learn.
+Each process collects from its own environments, and all take the same optimiser steps. The first process, rank 0, also
+writes, prints and evaluates. With a single process all functions here do nothing, or what a single process needs.
 """
 
 from __future__ import annotations
@@ -42,58 +42,58 @@ __all__ = [
     "texts",
 ]
 
-PATIENCE = 50.0  # s; longest wait for the other processes
+TIMEOUT = 50.0  # s; longest wait for the other processes
 TEXT_BYTES = 4096
 
 Key = TypeVar("Key")
-_met: list[bool] = []  # not empty once this process has trained with others: they part before the evaluation
+_joined: list[bool] = []  # not empty once this process was in a process group, which ends before the evaluation
 
 
 def rank() -> int:
-    """The number of this process."""
+    """The rank of this process."""
     if dist.is_initialized():
         return dist.get_rank()
     return int(os.environ["RANK"]) if dist.is_torchelastic_launched() else 0
 
 
 def size() -> int:
-    """How many processes train together now."""
+    """Number of processes that train together now."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
 def is_first() -> bool:
-    """Whether this process is the one that writes, prints and evaluates."""
+    """Whether this is the process that writes, prints and evaluates, rank 0."""
     return rank() == 0
 
 
 def print_rank0(text: str) -> None:
-    """Print a line, in the first process only."""
+    """Print a line in the first process."""
     if is_first():
         print(text, flush=True)
 
 
 @contextlib.contextmanager
 def process_group(device: str) -> Iterator[None]:
-    """Train together with the other processes that ``torchrun`` has started, until `leave` or the end.
+    """Join the other processes that ``torchrun`` has started, until `leave` or the end of the block.
 
     Args:
-        device: the run's.
+        device: of the run.
 
     Raises:
-        InputError: the others do not come, or these processes have trained together before.
+        InputError: the others do not answer, or these processes have trained together before.
     """
     if dist.is_initialized() or not dist.is_torchelastic_launched() or os.environ["WORLD_SIZE"] == "1":
         yield
         return
-    if _met:
+    if _joined:
         raise InputError("these processes have trained together already; start torchrun once for each run")
-    _met.append(True)
+    _joined.append(True)
     own = torch.device(own_device(device))
     if own.type == "cuda":
         torch.cuda.set_device(own)
-    with _others("did not meet"):
+    with _other_processes("could not reach the others"):
         dist.init_process_group(
-            "cpu:gloo,cuda:nccl" if own.type == "cuda" else "gloo", timeout=datetime.timedelta(seconds=PATIENCE)
+            "cpu:gloo,cuda:nccl" if own.type == "cuda" else "gloo", timeout=datetime.timedelta(seconds=TIMEOUT)
         )
     try:
         yield
@@ -102,16 +102,16 @@ def process_group(device: str) -> Iterator[None]:
 
 
 def leave() -> None:
-    """Train together no longer; each process may take its time from now on."""
+    """Leave the process group: from now on processes need not wait for each other."""
     if dist.is_initialized():
         dist.destroy_process_group()
 
 
 def own_device(device: str) -> str:
-    """Where this process trains: with ``cuda``, on the GPU of its number among the processes of its machine.
+    """The device of this process: with ``cuda``, the GPU of its local rank.
 
     Raises:
-        InputError: several processes of one machine would share the GPU that was named.
+        InputError: several processes of one machine would share a GPU.
     """
     if not device.startswith("cuda") or not dist.is_torchelastic_launched():
         return device
@@ -123,13 +123,13 @@ def own_device(device: str) -> str:
 
 
 def own_part(config: TrainConfig, begins_at: int = 0) -> TrainConfig:
-    """The settings of a run as this process follows them: its share of flocks, data and batches, and its own seed.
+    """The settings of a run for this process: its part of the environments, data and batches, and its own seed.
 
-    What cannot be shared equally is rounded up, so that all have equally much to do.
+    Parts are rounded up, so that all processes have the same.
 
     Args:
         config: the settings of the run.
-        begins_at: round from which a run goes on, so that the flocks that begin anew then are others.
+        begins_at: round from which a run resumes; environments that start afresh there get other seeds.
     """
     if size() == 1:
         return config
@@ -143,15 +143,15 @@ def own_part(config: TrainConfig, begins_at: int = 0) -> TrainConfig:
 
 
 def reduce_gradients(parameters: Iterable[Tensor], loss: Tensor, weight: Tensor) -> Tensor:
-    """Make the gradients that parameters hold those of the mean loss over all processes.
+    """Replace the gradients of parameters by their mean over all processes, in place.
 
     Args:
-        parameters: with or without gradient, in all processes the same.
-        loss: the mean over what counts in this process, [].
-        weight: how much counts in this process, []; with 0 neither loss nor gradients matter.
+        parameters: with or without gradient, the same in all processes.
+        loss: the loss of this process, a mean over agents, [].
+        weight: number of these agents, []; with 0 the loss and the gradients of this process are ignored.
 
     Returns:
-        the mean over what counts anywhere, [].
+        the mean loss over the agents of all processes, [].
     """
     loss = loss.detach()
     if size() == 1:
@@ -167,7 +167,7 @@ def reduce_gradients(parameters: Iterable[Tensor], loss: Tensor, weight: Tensor)
 
 
 def mean(values: Mapping[Key, float]) -> dict[Key, float]:
-    """Mean over all processes of each of some numbers, NaN left out; all must have the same names in one order."""
+    """The mean of each value over all processes, without NaN; all must give the same names in the same order."""
     if size() == 1:
         return dict(values)
     own = torch.tensor([float(value) for value in values.values()], dtype=torch.float64)
@@ -178,7 +178,7 @@ def mean(values: Mapping[Key, float]) -> dict[Key, float]:
 
 
 def mean_and_std(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of the numbers [M] of all processes, M may differ; [] each."""
+    """Mean and standard deviation, [] each, of the values [M] of all processes; M may differ between them."""
     if size() == 1:
         return values.mean(), values.std()
     sums = torch.stack([values.sum(), torch.full_like(values.sum(), len(values))])
@@ -191,7 +191,7 @@ def mean_and_std(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def average(*tensors: Tensor) -> None:
-    """Replace tensors by their means over all processes, in place."""
+    """Replace each tensor by its mean over all processes, in place."""
     if size() > 1:
         for tensor in tensors:
             _sum(tensor)
@@ -208,30 +208,30 @@ def any_of(*flags: bool) -> list[bool]:
 
 
 def texts(text: str) -> list[str]:
-    """The texts of all processes, in their order, of up to 4,096 bytes each."""
+    """The texts of all processes by rank, each cut to 4,096 bytes."""
     if size() == 1:
         return [text]
     content = text.encode()[:TEXT_BYTES]
     own = torch.tensor(list(content.ljust(TEXT_BYTES, b"\0")), dtype=torch.uint8)
     found = [torch.empty_like(own) for _ in range(size())]
-    with _others():
+    with _other_processes():
         dist.all_gather(found, own)
     return [bytes(each.tolist()).rstrip(b"\0").decode(errors="ignore") for each in found]
 
 
 def broadcast(tensors: Iterable[Tensor]) -> None:
-    """Replace tensors by those of the first process, in place."""
+    """Replace each tensor by that of the first process, in place."""
     if size() > 1:
-        with _others():
+        with _other_processes():
             for tensor in tensors:
                 dist.broadcast(tensor, src=0)
 
 
 def check_alike(tensors: Iterable[Tensor], when: str) -> None:
-    """Make sure that all processes hold the same tensors, to the last bit.
+    """Check that all processes hold bitwise equal tensors.
 
     Args:
-        tensors: what they should share.
+        tensors: the tensors.
         when: for the message.
 
     Raises:
@@ -246,25 +246,25 @@ def check_alike(tensors: Iterable[Tensor], when: str) -> None:
     if len(set(found)) > 1:
         others = [str(number) for number, each in enumerate(found) if each != found[0]]
         raise InputError(
-            f"the weights of process {', '.join(others)} are no longer those of process 0 {when}: all processes must "
-            "run on the same kind of machine with the same versions; go on from the last checkpoint with resume="
+            f"the weights of process {', '.join(others)} differ from those of process 0 {when}: all processes must run "
+            "on the same kind of machine with the same versions; continue from the last checkpoint with resume="
         )
 
 
 def _sum(tensor: Tensor) -> None:
     """Replace a tensor by its sum over all processes, in place."""
-    with _others():
+    with _other_processes():
         dist.all_reduce(tensor)
 
 
 @contextlib.contextmanager
-def _others(what: str = "lost the others") -> Iterator[None]:
-    """Say it in one sentence if the other processes do not answer."""
+def _other_processes(what: str = "lost the others") -> Iterator[None]:
+    """Raise an `InputError` of one sentence if the other processes do not answer."""
     try:
         yield
     except RuntimeError as error:
         reason = re.sub(r"^(\[[^\]]*\]\s*)+", "", str(error).strip().splitlines()[0]).split(". ")[0].rstrip(".")
         raise InputError(
-            f"process {rank()} of {os.environ.get('WORLD_SIZE', size())} {what} ({reason}): another has ended, as its "
-            f"own message says, or did not answer within {PATIENCE:g} s; go on from the last checkpoint with resume="
+            f"process {rank()} of {os.environ.get('WORLD_SIZE', size())} {what} ({reason}): another one has ended (see "
+            f"its own message) or did not answer within {TIMEOUT:g} s; continue from the last checkpoint with resume="
         ) from error

@@ -30,8 +30,7 @@ def member_configs(config: TrainConfig) -> dict[str, TrainConfig]:
     settings: BCConfig = config.trainer
     if config.init_from is not None and (settings.models, settings.hops) != (None, None):
         raise InputError(
-            "trainer.models and trainer.hops name fresh policies, init_from one that is there; leave out one or the "
-            "other"
+            "trainer.models and trainer.hops name new policies, init_from an existing one; leave out one or the other"
         )
     alone = dataclasses.replace(settings, models=None, hops=None, seeds=1)
     members = {}
@@ -51,13 +50,13 @@ def member_configs(config: TrainConfig) -> dict[str, TrainConfig]:
 def member_folders(
     run: RunFolder, members: Mapping[str, TrainConfig], learners: Mapping[str, ImitationLearner]
 ) -> Iterator[None]:
-    """When training ends, by Ctrl-C too, give each of several policies its own run folder inside the run's."""
+    """When training ends, also by Ctrl-C, give each of several policies its own run folder inside the run's."""
 
     def write() -> None:
         for name, member in members.items() if len(members) > 1 and distributed.is_first() else ():
             folder = RunFolder.create_inside(run, name, OmegaConf.to_yaml(OmegaConf.structured(member)))
             learner = learners[name]
-            if learner.updates_done:  # a run stopped before its first update leaves the checkpoint there was
+            if learner.updates_done:  # a resumed run that stops before its first update keeps the earlier checkpoint
                 policy = {"policy": learner.ema_policy.state_dict()}
                 save_checkpoint(folder.checkpoints, learner.updates_done, policy, {})
 

@@ -1,4 +1,4 @@
-"""Where people's own code is called while a trainer works, and stopping on a plateau, which is such code."""
+"""Callbacks: your own code, called while a trainer works; early stopping is one of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Callback", "StopOnPlateau"]
 
 
 class Callback:
-    """Called at four places of every trainer; each does nothing unless overridden.
+    """Base class of callbacks; every trainer calls the four methods below, which do nothing unless overridden.
 
     Example::
 
@@ -26,57 +26,57 @@ class Callback:
     """
 
     def on_start(self, policies: Mapping[str, ModGNN]) -> None:
-        """Training begins.
+        """Called when training starts or resumes.
 
         Args:
-            policies: what will be returned at the end, by name; their weights change while training goes on.
+            policies: the policies that training will return, by name; their weights change during training.
         """
 
     def on_collect(self, index: int, rollouts: TensorDictBase) -> None:
-        """Rollouts of a round have come in and are not yet learned from.
+        """Called when rollouts have been collected, before they are trained on.
 
         Args:
             index: number of the round.
-            rollouts: [B, T]; what is changed in place is learned from.
+            rollouts: [B, T]; changes made in place affect the training.
         """
 
     def on_round(self, index: int, metrics: Mapping[str, float]) -> bool | None:
-        """A round is over.
+        """Called at the end of a round.
 
         Args:
             index: number of the round.
             metrics: as in ``metrics.jsonl``.
 
         Returns:
-            true to stop the training here; the policy is evaluated as at the planned end.
+            true to stop training after this round; the policies are then evaluated as usual.
         """
 
     def on_end(self, policies: Mapping[str, ModGNN]) -> None:
-        """Training is over, but not interrupted.
+        """Called when training has ended, unless it was interrupted.
 
         Args:
-            policies: what is returned, by name.
+            policies: the policies that training returns, by name.
         """
 
     def state(self) -> dict[str, Any]:
-        """What checkpoints hold, as plain JSON values, so that a resumed run goes on exactly; nothing by default."""
+        """The state for checkpoints, as values that JSON can hold, so that runs resume exactly; default: empty."""
         return {}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state` gave, before `on_start`; nothing where the run had no such callback."""
+        """Return to what `state` returned; called before `on_start`, with ``{}`` if the run had no such callback."""
 
 
 class StopOnPlateau(Callback):
-    """Stop when a metric does not fall any more.
+    """Stops training when a metric no longer decreases.
 
-    Training stops after a round when the metric's mean over the last ``rounds`` rounds is not at least the share
-    ``gain`` below that over the ``rounds`` rounds before them.
+    Training stops after a round if the metric's mean over the last ``rounds`` rounds is above ``1 - gain`` times its
+    mean over the ``rounds`` rounds before them.
 
     Args:
-        rounds: how many rounds are compared with as many before.
-        gain: smallest relative improvement.
-        after: rounds that are left out at first, while the expert still flies.
-        name: the metric; rounds without it do not count.
+        rounds: number of rounds to average over.
+        gain: smallest relative decrease that counts as an improvement.
+        after: number of the round after which rounds count, for example when the expert no longer acts.
+        name: the metric; rounds in which it is missing or NaN do not count.
     """
 
     def __init__(self, rounds: int, gain: float, *, after: int = 0, name: str = "error") -> None:
@@ -84,7 +84,7 @@ class StopOnPlateau(Callback):
         self.seen: list[float] = []
 
     def on_round(self, index: int, metrics: Mapping[str, float]) -> bool:
-        """Look at the metric."""
+        """Compare the metric with that of earlier rounds."""
         value = metrics.get(self.name, math.nan)
         if index > self.after and math.isfinite(value):
             self.seen.append(value)
@@ -94,9 +94,9 @@ class StopOnPlateau(Callback):
         return now > (1 - self.gain) * before
 
     def state(self) -> dict[str, Any]:
-        """What was seen."""
+        """The values seen so far."""
         return {"seen": self.seen}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """See it again."""
+        """Return to what `state` returned."""
         self.seen = list(state.get("seen", []))

@@ -1,4 +1,4 @@
-"""What a dashboard shows of a training beyond its metrics: reference rollouts, actions, films, the final table."""
+"""What dashboards show beyond metrics: reference policies, actions, videos, and the final table."""
 
 from __future__ import annotations
 
@@ -23,23 +23,22 @@ from modgnn_rl.visualization.video import VIDEO_STRIDE, check_video, write_video
 
 __all__ = ["DashboardCallback", "log_evaluation"]
 
-STEPS = 200  # of a reference rollout and of a film
-FLOCKS = 4  # of 32 agents; of more agents there are fewer
-CHART_ROUNDS = 10  # rounds between which reference lines are drawn on
-MOST_ACTIONS = 30_000  # components in a histogram
+STEPS = 200  # of a reference rollout and of a video
+FLOCKS = 4  # of 32 agents; larger flocks are fewer
+CHART_ROUNDS = 10  # rounds after which reference lines are extended
+MAX_ACTIONS = 30_000  # components in a histogram
 
 
 class DashboardCallback(Callback):
-    """Shows on dashboards how others fly, how the policy acts, and films of it.
+    """Shows on dashboards the metrics of reference policies, the distribution of the actions, and videos.
 
-    The training is the same with it and without it, to the last bit. What of it fails is left out from then on, with
-    one warning.
+    Training is bitwise the same with and without it. A part that fails is turned off, with one warning.
 
     Args:
         config: the run's settings.
-        run: the run folder; films go into ``videos/`` there.
-        loggers: where to show it.
-        expert: whom the policy learns from; default: Reynolds flocking.
+        run: the run folder; videos go into ``videos/`` there.
+        loggers: the dashboards.
+        expert: the policy to imitate; default: Reynolds flocking.
     """
 
     def __init__(
@@ -51,61 +50,61 @@ class DashboardCallback(Callback):
     ) -> None:
         self.config, self.run, self.loggers, self.expert = config, run, loggers, expert
         self.policies: Mapping[str, ModGNN] = {}
-        self.lines: dict[str, dict[str, float]] = {}  # of each metric, by the name of who flies
+        self.lines: dict[str, dict[str, float]] = {}  # of each metric: the value of each reference policy
         self.shown: set[str] = set()  # metrics with lines
-        self.last = self.filmed = 0
+        self.last = self.last_video = 0  # rounds
         self._failed: set[str] = set()
 
     def on_start(self, policies: Mapping[str, ModGNN]) -> None:
-        """Fly the reference policies, and see whether films can be made."""
+        """Roll out the reference policies, and check whether videos can be made."""
         self.policies = policies
-        self._attempt("reference rollouts", self._fly_references)
-        if self._makes_films:
-            self._attempt("films", check_video)
+        self._attempt("reference rollouts", self._roll_out_references)
+        if self._makes_videos:
+            self._attempt("videos", check_video)
 
     def on_collect(self, index: int, rollouts: TensorDictBase) -> None:
-        """Show how the components of the flown actions are distributed, m/s."""
+        """Show a histogram of the components of the actions (m/s)."""
         self._attempt("actions", lambda: self._show_actions(index, rollouts))
 
     def on_round(self, index: int, metrics: Mapping[str, float]) -> None:
-        """Draw the reference lines on, and make a film where it is time."""
+        """Extend the reference lines and make a video, when it is time for them."""
         found = {name for name in metrics if self._line(name) in self.lines}
         is_time = index % CHART_ROUNDS == 0 or not found <= self.shown
         self.shown |= found
         self.last = index
         if is_time:
             self._attempt("reference lines", self._draw_lines)
-        if self._makes_films and index and index % self.config.video_rounds == 0:
-            self._attempt("films", self._film)
+        if self._makes_videos and index and index % self.config.video_rounds == 0:
+            self._attempt("videos", self._make_video)
 
     def on_end(self, policies: Mapping[str, ModGNN]) -> None:
-        """Draw the lines to the end, and film what there is at last."""
+        """Extend the reference lines to the end, and make a video of the final policy."""
         if self.last % CHART_ROUNDS:
             self._attempt("reference lines", self._draw_lines)
-        if self._makes_films and self.filmed != self.last:
-            self._attempt("films", self._film)
+        if self._makes_videos and self.last_video != self.last:
+            self._attempt("videos", self._make_video)
 
     @property
-    def _makes_films(self) -> bool:
+    def _makes_videos(self) -> bool:
         return self.config.video_rounds > 0 and self.loggers.shows_videos
 
     def _attempt(self, what: str, action: Callable[[], Any]) -> None:
-        """Do something that must neither stop the training nor draw from its random numbers."""
+        """Do something that must neither stop the training nor affect its random numbers."""
         if what in self._failed or not self.loggers:
             return
         try:
             with seeded(derive_seed(self.config.seed, "watching"), self.config.device):
                 action()
-        except Exception as error:  # whatever a dashboard lacks, training goes on
+        except Exception as error:  # whatever is missing, training continues
             self._failed.add(what)
             warnings.warn(
-                f"dashboards show no {what} from now on ({one_line(error)}); training goes on",
+                f"dashboards show no {what} from now on ({one_line(error)}); training continues",
                 RuntimeWarning,
                 stacklevel=3,
             )
 
-    def _fly_references(self) -> None:
-        """Measure the rollouts of the reference policies at each size."""
+    def _roll_out_references(self) -> None:
+        """Measure the reference policies at each flock size."""
         env_config = self.config.env
         for size in env_config.sizes:
             rows = {
@@ -137,19 +136,19 @@ class DashboardCallback(Callback):
         return min(STEPS, self.config.env.max_steps)
 
     def _line(self, metric: str) -> str:
-        """Under what name a metric's lines are kept, whose own name may begin with that of a policy."""
+        """The name of a metric in `lines`, without the name of a policy before it."""
         return metric if metric in self.lines else "/".join(metric.split("/")[-2:])
 
     def _draw_lines(self) -> None:
         self.loggers.log_references(self.last, {name: self.lines[self._line(name)] for name in sorted(self.shown)})
 
     def _show_actions(self, index: int, rollouts: TensorDictBase) -> None:
-        flown = rollouts["agents", "action"][rollouts["agents", "controlled"]].flatten()
+        actions = rollouts["agents", "action"][rollouts["agents", "controlled"]].flatten()
         size = rollouts["agents", "action"].shape[-2]
-        self.loggers.log_histogram(index, f"{size}/actions", flown[:: max(1, len(flown) // MOST_ACTIONS)])
+        self.loggers.log_histogram(index, f"{size}/actions", actions[:: max(1, len(actions) // MAX_ACTIONS)])
 
-    def _film(self) -> None:
-        """Film the first policy with the first size; always the same rollout, so that films can be compared."""
+    def _make_video(self) -> None:
+        """Make a video of the first policy at the first size, always from the same start, for comparison."""
         env_config, folder = self.config.env, self.run.path / "videos"
         size = env_config.sizes[0]
         recording = record(
@@ -165,12 +164,12 @@ class DashboardCallback(Callback):
         folder.mkdir(exist_ok=True)
         path = folder / f"round_{self.last:05d}.mp4"
         write_video(path, recording)
-        self.filmed = self.last
+        self.last_video = self.last
         self.loggers.log_video(self.last, f"{size}/rollout", path)
 
 
 def _measures(rollouts: EpisodeMetrics, steps: int) -> dict[str, float]:
-    """Figures of rollouts by the names that trainers give to those of the policy's own."""
+    """Metrics of rollouts by the names that `rollout_metrics` gives them."""
     names = ("error", "leader_distance", "cohesion", "separation", "collision_rate", "lost", "diverged")
     means = {name: float(getattr(rollouts, name).double().mean()) for name in names}
     smallest, reward = float(rollouts.min_distance.min()), float(rollouts.reward.mean()) / steps

@@ -32,18 +32,18 @@ __all__ = [
 
 
 def make_learner(config: TrainConfig, updates: tuple[int, int], member: int = 0) -> ImitationLearner:
-    """The learner of a run, or one of several that differ in the weights that they begin with.
+    """The learner of a run, or one of several that differ in their initial weights.
 
     Args:
         config: the run's settings.
         updates: updates until the first cosine of the learning rate ends, and of the whole run.
-        member: which of several.
+        member: index of the learner.
     """
     return ImitationLearner(initial_policy(config, member), config.trainer, updates, config.seed)
 
 
 def initial_policy(config: TrainConfig, member: int = 0) -> ModGNN:
-    """The policy that a run begins with: that of another run, or a fresh one of ``config.model``; on the run's device.
+    """The policy that a run starts from, on its device: that of another run, or a new one of ``config.model``.
 
     Raises:
         InputError: no readable run ``config.init_from``.
@@ -61,10 +61,10 @@ def members_of(config: TrainConfig) -> dict[str, TrainConfig]:
 
 
 def resolve_model(config: TrainConfig) -> TrainConfig:
-    """The settings with the model that is trained: that of ``init_from``, or the first of several policies.
+    """The settings with the model that is trained: that of ``init_from``, or that of the first of several policies.
 
     Raises:
-        InputError: no readable run ``config.init_from``, or another model was asked for, or several.
+        InputError: no readable run ``config.init_from``, or it has another model than the settings name.
     """
     model = next(iter(members_of(config).values())).model
     if config.init_from is not None:
@@ -72,7 +72,7 @@ def resolve_model(config: TrainConfig) -> TrainConfig:
         if config.model not in (model, ModelConfig()):
             raise InputError(
                 f"model={config.model} is not that of init_from={config.init_from}, {model}; leave the model out, it "
-                "comes from there"
+                "is taken from there"
             )
     return dataclasses.replace(config, model=model)
 
@@ -92,12 +92,13 @@ def check_training(config: TrainConfig, expert: TensorDictModuleBase | None = No
     sizes = config.env.sizes
     if len(set(sizes)) != len(sizes) or min(sizes) < 2:
         raise InputError(
-            f"env.num_agents={sizes} must name each size once, and none below 2: the leader is not trained"
+            f"env.num_agents={sizes} must list each size once, and none below 2: the leader is not trained"
         )
     members = list(members_of(config).values())
     if config.init_from is not None and len(members) > 1:
         raise InputError(
-            "several policies cannot all begin with that of init_from, and stay alike: leave it out, or train one"
+            "several policies cannot all start from that of init_from, they would stay equal: leave it out, or train "
+            "one policy"
         )
     policies = [initial_policy(member) for member in members]
     for member, policy in zip(members, policies, strict=True):
@@ -116,7 +117,7 @@ def check_updates(config: TrainConfig, name: str) -> None:
     """Refuse fewer updates than there are flock sizes, which share them; ``name`` is the trainer's setting."""
     updates, sizes = getattr(config.trainer, name), len(config.env.sizes)
     if 0 < updates < sizes:
-        raise InputError(f"trainer.{name}={updates} is too few for {sizes} sizes; give at least one to each")
+        raise InputError(f"trainer.{name}={updates} is too few for {sizes} flock sizes; give at least one to each")
 
 
 def check_steps(config: TrainConfig, name: str, needed: int) -> None:

@@ -1,4 +1,4 @@
-"""The policy as an actor that explores: its action is the mean of a normal distribution."""
+"""A policy with exploration noise: its action is the mean of a normal distribution."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ __all__ = ["GaussianActor"]
 
 
 class GaussianActor(ProbabilisticTensorDictSequential):
-    """A policy whose actions are drawn around what it would do: ``a ~ N(policy(o), sigma^2)`` in each component.
+    """Samples actions around those of a policy: ``a ~ N(policy(o), sigma^2)`` in each component.
 
-    The draws are not clipped: that is the environment's part, so that collection and loss agree on their probability.
-    One sigma, learned, for all agents. With ``set_exploration_type(DETERMINISTIC)`` it acts as the policy does.
+    Samples are not clipped: the environment does that, so that collection and loss agree on their probability. Sigma is
+    learned, and the same for all agents. With ``set_exploration_type(DETERMINISTIC)`` it acts like the policy.
 
     Args:
-        policy: writes its action as its first out-key; used as it is, not copied.
-        noise: sigma at the start, in the action's unit (m/s).
-        loc, scale, log_prob: keys that mean, sigma [*B, N, A] and the log-probability of the action [*B, N] go to.
-        receivers: key of the agents whose action matters, bool [*B, N]. Where the data have it, the others' mean is not
-            computed (the policy is called with ``receivers=``) and is zero.
+        policy: writes its action under its first out-key; not copied.
+        noise: initial sigma, in the unit of the action (m/s).
+        loc, scale, log_prob: keys for mean and sigma [*B, N, A] and the log-probability of the action [*B, N].
+        receivers: key of the agents whose action counts, bool [*B, N]. If the data have it, the mean of the others is
+            not computed (the policy is called with ``receivers=``) and is zero.
     """
 
     def __init__(
@@ -57,12 +57,12 @@ class GaussianActor(ProbabilisticTensorDictSequential):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """The policy whose actions are the mean."""
+        """The policy whose action is the mean."""
         return self.module[0].policy
 
     @property
     def noise(self) -> float:
-        """Sigma as it is now."""
+        """The current sigma."""
         return float(self.module[0].log_scale.detach().exp())
 
 

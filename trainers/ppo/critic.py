@@ -1,4 +1,4 @@
-"""The central critic: sees the whole flock, whatever its size and order, and values what lies before each agent."""
+"""The central critic: estimates the value of each agent from the whole flock, of any size and in any order."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from modgnn_rl.utils.tensors import pair_distances
 
 __all__ = ["FlockCritic", "PooledCritic", "flock_features"]
 
-NEAR = 0.4  # m; crowds are felt over this distance
+NEAR = 0.4  # m; length scale of the crowding feature
 
 
 class PooledCritic(nn.Module):
-    """A value for each agent from features of all: ``V_i = rho(x_i, mean_j phi(x_j), max_j phi(x_j))`` (Deep Sets).
+    """A value for each agent from the features of all: ``V_i = rho(x_i, mean_j phi(x_j), max_j phi(x_j))``.
 
-    Permuting the agents permutes the values. It works at any number of agents.
+    This is Deep Sets (Zaheer et al. 2017): permuting the agents permutes the values, and any number of agents will do.
 
     Args:
         features: width of x.
@@ -32,11 +32,11 @@ class PooledCritic(nn.Module):
         self.rho = mlp(features + 2 * hidden, hidden, 1)
 
     def forward(self, features: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Value each agent.
+        """Estimate the value of each agent.
 
         Args:
             features: [*B, N, F].
-            mask: agents that are there, bool [*B, N]; the others are not pooled. Default: all.
+            mask: agents that exist, bool [*B, N]; the others are not pooled. Default: all.
 
         Returns:
             values [*B, N, 1].
@@ -45,27 +45,27 @@ class PooledCritic(nn.Module):
         if mask is None:
             pooled = torch.cat((encoded.mean(-2, keepdim=True), encoded.amax(-2, keepdim=True)), -1)
         else:
-            there = mask.unsqueeze(-1)
-            mean = torch.where(there, encoded, 0.0).sum(-2, keepdim=True) / there.sum(-2, keepdim=True).clamp(min=1)
+            exists = mask.unsqueeze(-1)
+            mean = torch.where(exists, encoded, 0.0).sum(-2, keepdim=True) / exists.sum(-2, keepdim=True).clamp(min=1)
             lowest = torch.finfo(encoded.dtype).min
-            largest = torch.where(there, encoded, lowest).amax(-2, keepdim=True)
+            largest = torch.where(exists, encoded, lowest).amax(-2, keepdim=True)
             pooled = torch.cat((mean, torch.where(mask.any(-1)[..., None, None], largest, 0.0)), -1)
         return self.rho(torch.cat((features, pooled.expand(*features.shape[:-1], -1)), -1))
 
 
 def flock_features(state: Tensor, mask: Tensor | None = None) -> Tensor:
-    """What matters of a flock to each agent, whatever the flock's place, attitude and order: 15 numbers of order one.
+    """Features of each agent that do not depend on the flock's position, attitude and order, of magnitude one.
 
-    Distance, closing speed and difference of the velocities, each with respect to the leader (agent 0) and to the
-    flock's mean; the same of the leader to that mean; distance of the nearest agent; how crowded it is around the
-    agent; speed.
+    Distance (scaled, and its logarithm), closing speed and velocity difference, each with respect to the leader
+    (agent 0) and to the flock's mean, and of the leader with respect to that mean; distance of the nearest agent;
+    crowding ``sum_j exp(-d_ij / 0.4 m)``; speed.
 
     Args:
-        state: position, m, and velocity, m/s [*B, N, 6].
-        mask: agents that are there, bool [*B, N]. Default: all.
+        state: position (m) and velocity (m/s) [*B, N, 6].
+        mask: agents that exist, bool [*B, N]. Default: all.
 
     Returns:
-        [*B, N, 15].
+        features [*B, N, 15].
     """
     position, velocity = state.split(3, -1)
     there = None if mask is None else mask.unsqueeze(-1)
@@ -96,7 +96,7 @@ class FlockCritic(TensorDictModuleBase):
 
     Args:
         state: key of the true states [*B, N, 6].
-        mask: key of the agents that are there, bool [*B, N], read where there is one.
+        mask: key of the agents that exist, bool [*B, N]; optional in the data.
         value: key that the values [*B, N, 1] are written to.
         hidden: width of the networks.
     """

@@ -234,7 +234,7 @@ def test_weights_that_drift_apart_are_noticed(tmp_path):
 
     for error in _in_two_processes(tmp_path, check):
         assert isinstance(error, InputError)
-        assert "process 1 are no longer those of process 0 after round 4" in str(error)
+        assert "process 1 differ from those of process 0 after round 4" in str(error)
 
 
 class Spy(Callback):
@@ -324,7 +324,7 @@ def test_sigterm_to_torchrun_leaves_a_checkpoint(tmp_path):
     process.wait(40)
     assert run.state == "stopped"
     assert load_checkpoint(run.checkpoints).step == len(run.read_metrics()) == run.status["round"]
-    assert output.read_text().count("to go on: python -m modgnn_rl.train") == 1
+    assert output.read_text().count("To resume: python -m modgnn_rl.train") == 1
 
 
 @pytest.mark.slow
@@ -342,5 +342,5 @@ def test_a_killed_process_ends_the_other(tmp_path, number):
     assert run.state == ("killed" if number == 0 else "failed")
     (line,) = re.findall(r"^error: process.*$", output.read_text(), re.MULTILINE)
     assert f"process {1 - number} of 2 lost the others" in line
-    assert "go on from the last checkpoint with resume=" in line
+    assert "continue from the last checkpoint with resume=" in line
     load_checkpoint(run.checkpoints)

@@ -216,7 +216,7 @@ def test_what_fails_is_left_out_with_one_warning(watch, monkeypatch):
     with pytest.warns(RuntimeWarning) as caught:
         go_on()
     assert [str(warning.message) for warning in caught] == [
-        "dashboards show no films from now on (no room); training goes on"
+        "dashboards show no videos from now on (no room); training continues"
     ]
     assert recorder.references
 
@@ -230,6 +230,6 @@ def test_missing_packages_are_said_once(tmp_path, monkeypatch):
         for index in range(1, 41):
             watch.on_round(index, {})
 
-    with pytest.warns(RuntimeWarning, match="no films from now on .*pip install av matplotlib") as caught:
+    with pytest.warns(RuntimeWarning, match="no videos from now on .*pip install av matplotlib") as caught:
         use()
     assert len(caught) == 1
