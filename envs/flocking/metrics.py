@@ -1,8 +1,10 @@
-"""How well a flock flies: the paper's metrics (section Results) and a few about safety, as functions of tensors.
+"""Metrics of a flock: those of the paper (section Results), safety, and reward, as functions of tensors.
 
 A flock is ``position [*B, N, 3]`` in metres, with any leading dimensions ``*B`` (flocks, time steps, seeds); the
-result has one number for each flock, ``[*B]``, unless it says otherwise. Distances are taken from coordinate
-differences in the dtype given, never by the expansion of the square, which loses close pairs far from the origin.
+result has one value per flock, ``[*B]``, unless it says otherwise. Distances are computed from coordinate differences
+in the given dtype, never by expanding the square, which loses close pairs far from the origin.
+
+Each is registered with what tables and dashboards need to know of it; `modgnn_rl.metrics` explains the options.
 """
 
 from __future__ import annotations
@@ -14,10 +16,12 @@ from torch import Tensor
 
 from modgnn_rl.envs.flocking.spheres import smallest_enclosing_sphere
 from modgnn_rl.errors import InputError
+from modgnn_rl.registry import METRICS
 from modgnn_rl.utils.tensors import pair_blocks, pair_differences, squared_norm
 
 __all__ = [
     "action_error",
+    "agent_reward",
     "cohesion",
     "collision_rate",
     "is_diverged",
@@ -28,26 +32,47 @@ __all__ = [
 ]
 
 
+@METRICS.register(
+    "error",
+    title="error",
+    unit="m²/s²",
+    better="lower",
+    about="mean squared error of the action against the expert's, per component, over the agents the policy controls",
+    inputs=("action", "expert_action", "controlled"),
+    over_time="mean",
+    cell="{mean:.3f} ± {std:.3f} [{low:.3f}, {high:.3f}]",
+    replay=True,
+)
 def action_error(action: Tensor, expert_action: Tensor, controlled: Tensor) -> Tensor:
-    """Mean squared error per component against the expert, over the agents that the policy flies.
+    """Mean squared error per component against the expert, over the agents that the policy controls.
 
-    ``sum_i c_i |u_i - u*_i|^2 / (D sum_i c_i)`` with ``c = controlled``; the paper's "Error". What the other agents
-    hold has no influence, not even a NaN.
+    ``sum_i c_i |u_i - u*_i|^2 / (D sum_i c_i)`` with ``c = controlled``; the paper's "Error". Values of the other
+    agents have no influence, not even a NaN.
 
     Args:
         action: ``[*B, N, D]``, target velocity in m/s.
         expert_action: ``[*B, N, D]``, m/s.
-        controlled: ``[*B, N]`` bool, the agents that the policy flies.
+        controlled: ``[*B, N]`` bool, the agents that the policy controls.
 
     Returns:
-        ``[*B]`` in (m/s)^2; NaN for a flock in which the policy flies nobody.
+        ``[*B]`` in (m/s)^2; NaN for a flock without controlled agents.
     """
     squared = (action - expert_action).square().mean(-1)
     return torch.where(controlled, squared, 0.0).sum(-1) / controlled.sum(-1)
 
 
+@METRICS.register(
+    "leader_distance",
+    title="leader distance",
+    unit="m",
+    better="lower",
+    about="distance from the leader to the centre of mass of the others",
+    over_time="mean",
+    cell="{mean:.2f} ± {std:.2f} [{low:.2f}, {high:.2f}]",
+    replay=True,
+)
 def leader_distance(position: Tensor, leader: int = 0) -> Tensor:
-    """Distance from the leader to the centre of mass of the rest, ``|p_l - mean_{i != l} p_i|``.
+    """Distance from the leader to the centre of mass of the others, ``|p_l - mean_{i != l} p_i|``.
 
     Args:
         position: ``[*B, N, 3]``, m.
@@ -66,18 +91,39 @@ def leader_distance(position: Tensor, leader: int = 0) -> Tensor:
     return distance
 
 
+@METRICS.register(
+    "cohesion",
+    title="cohesion",
+    unit="m",
+    better="lower",
+    about="diameter of the smallest sphere that encloses all agents",
+    over_time="mean",
+    cell="{mean:.2f} ± {std:.2f} [{low:.2f}, {high:.2f}]",
+    every=10,
+    replay=True,
+)
 def cohesion(position: Tensor) -> Tensor:
-    """Diameter of the smallest sphere that holds all agents.
+    """Diameter of the smallest sphere that encloses all agents.
 
     Args:
         position: ``[*B, N, 3]``, m.
 
     Returns:
-        ``[*B]`` in m, without gradient; NaN for a flock with a coordinate that is not finite.
+        ``[*B]`` in m, without gradient; NaN for a flock with a coordinate that is NaN or infinite.
     """
     return 2 * smallest_enclosing_sphere(position)[1]
 
 
+@METRICS.register(
+    "separation",
+    title="separation",
+    unit="m",
+    better="higher",
+    about="distance from an agent to its nearest neighbour",
+    over_time="mean",
+    cell="{mean:.2f} ± {std:.2f} [{low:.2f}, {high:.2f}]",
+    replay=True,
+)
 def separation(position: Tensor) -> Tensor:
     """Distance from each agent to its nearest neighbour, ``min_{j != i} |p_i - p_j|``.
 
@@ -88,7 +134,7 @@ def separation(position: Tensor) -> Tensor:
         position: ``[*B, N, 3]``, m.
 
     Returns:
-        ``[*B, N]`` in m; NaN for an agent alone, and for all agents of a flock that holds a NaN.
+        ``[*B, N]`` in m; NaN for a flock of one, and for all agents of a flock that contains a NaN.
     """
     if position.shape[-2] == 1:
         return torch.full_like(position[..., 0], torch.nan)
@@ -96,6 +142,15 @@ def separation(position: Tensor) -> Tensor:
     return nearest.sqrt().reshape(position.shape[:-1])
 
 
+@METRICS.register(
+    "min_distance",
+    title="minimum distance",
+    unit="m",
+    better="higher",
+    about="smallest distance between two agents at any step of any episode",
+    over_time="min",
+    cell="{min:.2f}",
+)
 def min_distance(position: Tensor) -> Tensor:
     """Distance of the closest pair, ``min_{i < j} |p_i - p_j|``.
 
@@ -103,27 +158,93 @@ def min_distance(position: Tensor) -> Tensor:
         position: ``[*B, N, 3]``, m.
 
     Returns:
-        ``[*B]`` in m; NaN where there is no pair, and for a flock that holds a NaN.
+        ``[*B]`` in m; NaN for a flock of one or one that contains a NaN.
     """
     return separation(position).amin(-1)
 
 
+@METRICS.register(
+    "collision_rate",
+    title="collision rate",
+    unit="pairs",
+    better="lower",
+    about="number of pairs of agents closer than env.collision_distance, mean over the steps",
+    settings=("collision_distance",),
+    over_time="mean",
+    cell="{mean:.2g}",
+)
 def collision_rate(position: Tensor, distance: float) -> Tensor:
-    """Number of pairs ``i < j`` with ``|p_i - p_j| < distance``.
+    """Number of colliding pairs: ``i < j`` with ``|p_i - p_j| < distance``.
 
     Args:
         position: ``[*B, N, 3]``, m.
-        distance: m.
+        distance: below which two agents collide, m.
 
     Returns:
-        ``[*B]``, int64. A pair with a coordinate that is not finite does not count.
+        ``[*B]``, int64. A pair with a NaN or infinite coordinate does not count.
     """
     close = torch.cat([(block.sqrt() < distance).sum(-1).flatten() for block in _squared_distances(position)])
     return close.reshape(position.shape[:-1]).sum(-1) // 2
 
 
+@METRICS.register(
+    "reward",
+    title="reward",
+    unit="",
+    better="higher",
+    about="reward of an agent, summed over the episode",
+    inputs=("reward",),
+    over_time="sum",
+    cell="{mean:.1f} [{low:.1f}, {high:.1f}]",
+)
+def agent_reward(reward: Tensor) -> Tensor:
+    """Reward of each agent in a step, ``[*B, N]``, as the environment gives it."""
+    return reward
+
+
+@METRICS.register(
+    "leader_lost",
+    title="leader lost",
+    unit="%",
+    better="lower",
+    about="fraction of episodes that end with the leader out of everyone's range (env.comm_range)",
+    settings=("comm_range",),
+    over_time="last",
+    cell="{mean:.0%}",
+)
+def leader_lost(position: Tensor, comm_range: float, leader: int = 0) -> Tensor:
+    """Whether the flock has lost its leader: no agent is within ``comm_range`` of it.
+
+    Args:
+        position: ``[*B, N, 3]``, m.
+        comm_range: distance up to which agents communicate, m.
+        leader: index of the leader.
+
+    Returns:
+        ``[*B]`` bool; False for a leader without followers, True for one whose position is NaN or infinite.
+
+    Raises:
+        InputError: there is no agent ``leader``.
+    """
+    lead, rest = _split(position, leader)
+    if rest.shape[-2] == 0:
+        return torch.zeros(position.shape[:-2], dtype=torch.bool, device=position.device)
+    distance: Tensor = torch.linalg.vector_norm(rest - lead[..., None, :], dim=-1)
+    return ~(distance <= comm_range).any(-1)
+
+
+@METRICS.register(
+    "diverged",
+    title="diverged",
+    unit="%",
+    better="lower",
+    about="fraction of episodes in which an agent is farther than env.max_distance from the centre of mass",
+    settings=("max_distance",),
+    over_time="any",
+    cell="{mean:.0%}",
+)
 def is_diverged(position: Tensor, max_distance: float, exists: Tensor | None = None) -> Tensor:
-    """Whether the flock has fallen apart: some agent is too far from the centre of mass, or not finite.
+    """Whether the flock has fallen apart: some agent is too far from the centre of mass, or NaN or infinite.
 
     Args:
         position: ``[*B, N, 3]``, m.
@@ -139,27 +260,6 @@ def is_diverged(position: Tensor, max_distance: float, exists: Tensor | None = N
         position = torch.where(there, position, centre)
     distance = squared_norm((position - position.mean(-2, keepdim=True)).unbind(-1)).sqrt()
     return ~(distance <= max_distance).all(-1)  # written so that a NaN counts as diverged
-
-
-def leader_lost(position: Tensor, comm_range: float, leader: int = 0) -> Tensor:
-    """Whether the flock has lost its leader: nobody is within ``comm_range`` of it.
-
-    Args:
-        position: ``[*B, N, 3]``, m.
-        comm_range: distance at which agents still hear each other, m.
-        leader: index of the leader.
-
-    Returns:
-        ``[*B]`` bool; False for a leader without followers, True for one whose position is not finite.
-
-    Raises:
-        InputError: there is no agent ``leader``.
-    """
-    lead, rest = _split(position, leader)
-    if rest.shape[-2] == 0:
-        return torch.zeros(position.shape[:-2], dtype=torch.bool, device=position.device)
-    distance: Tensor = torch.linalg.vector_norm(rest - lead[..., None, :], dim=-1)
-    return ~(distance <= comm_range).any(-1)
 
 
 def _split(position: Tensor, leader: int) -> tuple[Tensor, Tensor]:

@@ -11,19 +11,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.flocking.metrics import action_error, cohesion, leader_distance, separation
+from modgnn_rl.envs.flocking.metrics import action_error
+from modgnn_rl.metrics import compute_metrics
+from modgnn_rl.registry import METRICS
 from modgnn_rl.visualization.recording import QUANTUM, Frame, MetricSeries, Recording, quantise, range_flips
 
 __all__ = ["FlockRecorder", "edge_array", "flock_frame"]
 
 Array = NDArray[Any]
-
-TITLES = {
-    "error": ("Error against the expert", "m²/s²"),
-    "leader_distance": ("Leader to the others' centre", "m"),
-    "cohesion": ("Cohesion: diameter", "m"),
-    "separation": ("Separation: nearest neighbour", "m"),
-}
 
 
 def flock_frame(flock: TensorDictBase, config: FlockingConfig) -> Frame:
@@ -96,18 +91,19 @@ class FlockRecorder:
         """The recording so far; metrics other than the error are computed from the recorded positions."""
         position = np.stack(self._recorded["position"])
         metres = torch.from_numpy(position).double() * QUANTUM
-        metrics = {
-            "error": np.stack(self._recorded["error"]),
-            "leader_distance": leader_distance(metres).numpy(),
-            "cohesion": cohesion(metres).numpy(),
-            "separation": separation(metres).mean(-1).numpy(),
-        }
+        plotted = {name: entry.options for name, entry in METRICS.items() if entry.options.get("replay")}
+        shape = compute_metrics([name for name in plotted if name != "error"], self.config, {"position": metres})
+        values = {name: value.reshape(len(value), -1).mean(-1).numpy() for name, value in shape.items()}
+        values["error"] = np.stack(self._recorded["error"])
         return Recording(
             position=position,
             target_velocity=np.stack(self._recorded["target_velocity"]),
             present=np.stack(self._recorded["present"]),
             flips=self._recorded["flips"],
-            metrics={name: MetricSeries(*TITLES[name], values) for name, values in metrics.items()},
+            metrics={
+                name: MetricSeries(option["title"].capitalize(), option["unit"], values[name])
+                for name, option in plotted.items()
+            },
             stride=self.stride,
             comm_range=self.config.comm_range,
             max_speed=self.config.max_speed,

@@ -1,9 +1,10 @@
-"""How well policies fly: rollouts from the same starts, measured, beside the expert's and those of doing nothing."""
+"""Rollouts of policies and of reference policies from the same starts, and their metrics."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Mapping
 
 import torch
@@ -16,77 +17,61 @@ from torchrl.modules import get_primers_from_module, set_recurrent_mode
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
-from modgnn_rl.envs.flocking.metrics import (
-    action_error,
-    cohesion,
-    collision_rate,
-    is_diverged,
-    leader_distance,
-    leader_lost,
-    min_distance,
-    separation,
-)
+from modgnn_rl.metrics import compute_metrics
+from modgnn_rl.registry import METRICS
 from modgnn_rl.utils.progress import Progress
 
 __all__ = ["EpisodeMetrics", "evaluate", "make_eval_env", "reference_policies", "rollout"]
 
 QUARTERS = 4
-FRAME = 10  # cohesion, the only costly metric, is taken at each tenth step
+ACTION = ("agents", "action")
+FOLDS = {"min": torch.minimum, "any": torch.logical_or}
 
 
 @dataclasses.dataclass
 class EpisodeMetrics:
-    """What was measured on rollouts, one entry a flock [F], averaged over its steps (and agents).
+    """Metrics of F episodes, one flock each.
 
     Attributes:
-        error: mean squared error of the action against the expert's, per component, m^2/s^2, over controlled agents.
-        error_by_quarter: the same in the four quarters of the rollout [F, 4].
-        leader_distance: distance of the leader from the centre of mass of the others, m.
-        cohesion: diameter of the smallest enclosing sphere, m.
-        separation: distance to the nearest neighbour, m.
-        squares: means of the squares of the last three, for standard deviations over time, agents and flocks.
-        min_distance: smallest distance of two agents at any step, m.
-        collision_rate: mean number of touching pairs.
-        reward: reward of an agent, summed over the rollout.
-        lost: nobody is within range of the leader at the end, bool.
-        diverged: an agent was farther than ``max_distance`` from the centre of mass at some step, bool.
+        values: by name of the metric, its value over the steps (and agents) of each episode [F]: float64 for a mean or
+            a sum, the dtype of the positions for a minimum, bool for what holds or does not.
+        mean_squares: by name, the mean over the steps and agents of the squares of each metric that is a mean [F], for
+            standard deviations over time.
+        error_by_quarter: the error in the four quarters of each episode [F, 4].
     """
 
-    error: Tensor
+    values: dict[str, Tensor]
+    mean_squares: dict[str, Tensor]
     error_by_quarter: Tensor
-    leader_distance: Tensor
-    cohesion: Tensor
-    separation: Tensor
-    squares: dict[str, Tensor]
-    min_distance: Tensor
-    collision_rate: Tensor
-    reward: Tensor
-    lost: Tensor
-    diverged: Tensor
+
+    def __getitem__(self, name: str) -> Tensor:
+        """The values of a metric [F]."""
+        return self.values[name]
 
 
 def reference_policies(
     config: FlockingConfig, expert: TensorDictModuleBase | None = None
 ) -> dict[str, TensorDictModuleBase]:
-    """The rows that every table has: the expert, the expert with a policy's eyes, and doing nothing.
+    """The policies that every table is compared with, by name.
 
-    Of an expert of one's own, only it and doing nothing.
+    Args:
+        config: environment config.
+        expert: writes ``("agents", "expert_action")``; default: Reynolds flocking.
+
+    Returns:
+        the expert, the local experts of 2 hops and of 1 hop, which see what a policy sees (Reynolds flocking only), and
+        the zero action.
     """
-    key = ("agents", "action")
-    idle = TensorDictModule(_zero_action, in_keys=[("agents", "observation")], out_keys=[key])
+    idle = TensorDictModule(_zero_action, in_keys=[("agents", "observation")], out_keys=[ACTION])
     if expert is not None:
-        fly_it = TensorDictModule(_as_it_is, in_keys=expert.out_keys[:1], out_keys=[key])
-        return {"expert": TensorDictSequential(expert, fly_it), "zero action": idle}
+        act = TensorDictModule(torch.clone, in_keys=expert.out_keys[:1], out_keys=[ACTION])
+        return {"expert": TensorDictSequential(expert, act), "zero action": idle}
     return {
-        "expert": Reynolds.for_env(config, action=key),
-        "LocalReynolds(hops=2)": LocalReynolds.for_env(config, hops=2, action=key),
-        "LocalReynolds(hops=1)": LocalReynolds.for_env(config, hops=1, action=key),
+        "expert": Reynolds.for_env(config, action=ACTION),
+        "local expert (2 hops)": LocalReynolds.for_env(config, hops=2, action=ACTION),
+        "local expert (1 hop)": LocalReynolds.for_env(config, hops=1, action=ACTION),
         "zero action": idle,
     }
-
-
-def _as_it_is(action: Tensor) -> Tensor:
-    return action.clone()
 
 
 def _zero_action(observation: Tensor) -> Tensor:
@@ -103,7 +88,7 @@ def make_eval_env(
     seed: int,
     device: torch.device | str = "cpu",
 ) -> TransformedEnv:
-    """A world in which every flock flies ``steps`` steps, whatever happens to it, with the policy's recurrent state."""
+    """An environment in which every episode lasts ``steps`` steps, with the policy's recurrent state."""
     env_config = dataclasses.replace(config, max_distance=torch.inf, max_colliding=1.0, max_steps=steps)
     base = FlockingEnv(num_flocks, num_agents, config=env_config, seed=seed, device=device)
     primers = get_primers_from_module(policy, warn=False)
@@ -124,89 +109,98 @@ def rollout(
     expert: TensorDictModuleBase | None = None,
     watch: Callable[[TensorDictBase], None] | None = None,
 ) -> EpisodeMetrics:
-    """Fly fresh flocks with a policy to the end of the episode and measure them.
+    """Roll out a policy for one episode per flock and compute its metrics.
 
-    Every flock is flown for all steps, also a diverged one, so that none drops out of the averages. Rollouts with equal
-    seeds have the same starts and the same leaders, whatever the policy.
+    No episode ends early, not even that of a flock that has diverged, so all count in the averages. Equal seeds give
+    equal starts and leaders, whatever the policy.
 
     Args:
-        policy: reads the environment's keys, writes ``("agents", "action")``; its recurrent state is added by itself.
-        config: the world.
-        num_agents: agents in a flock, N.
+        policy: reads the environment's keys, writes ``("agents", "action")``; its recurrent state is added to them.
+        config: environment config.
+        num_agents: agents per flock, N.
         num_flocks: flocks, F.
-        steps: steps of a rollout.
+        steps: steps per episode.
         seed: seed of starts and leaders.
-        device: where to fly.
-        progress: counts flock-steps.
-        expert: what errors are measured against, writes ``("agents", "expert_action")``; default: Reynolds flocking.
-        watch: is shown the flocks before each step, with both actions; see
+        device: of the environment.
+        progress: counts steps of flocks.
+        expert: reference of the error, writes ``("agents", "expert_action")``; default: Reynolds flocking.
+        watch: called before each step with all flocks and both actions; see
             `modgnn_rl.envs.flocking.recording.FlockRecorder`.
     """
     env = make_eval_env(policy, config, num_flocks, num_agents, steps=steps, seed=seed, device=device)
     expert = expert or Reynolds.for_env(config)
-    means = _Means(num_flocks, device)
-    quarters = torch.zeros(num_flocks, QUARTERS, device=device)
-    closest = torch.full((num_flocks,), torch.inf, device=device)
-    diverged = torch.zeros(num_flocks, dtype=torch.bool, device=device)
+    episodes = _Accumulator(num_flocks, steps, device)
     tensordict = env.reset()
     with contextlib.closing(env), set_recurrent_mode(False):
         for step in range(steps):
-            position = tensordict[config.state_key][..., :3]
             tensordict = expert(policy(tensordict))
             if watch is not None:
                 watch(tensordict)
-            agents = tensordict["agents"]
-            error = action_error(agents["action"], agents["expert_action"], agents["controlled"])
-            quarters[:, step * QUARTERS // steps] += error
-            means.add("error", error)
-            means.add("leader_distance", leader_distance(position))
-            means.add("separation", separation(position))
-            means.add("collision_rate", collision_rate(position, config.collision_distance))
-            if step % FRAME == 0:
-                means.add("cohesion", cohesion(position))
-            closest = torch.minimum(closest, min_distance(position))
-            diverged |= is_diverged(position, config.max_distance)
             tensordict = env.step(tensordict)
-            means.add("reward", tensordict["next", "agents", "reward"].squeeze(-1))
+            episodes.add(step, _step_metrics(tensordict, config, step))
             tensordict = env.step_mdp(tensordict)
             if progress is not None:
                 progress.update(num_flocks)
-    counts = torch.bincount(torch.arange(steps) * QUARTERS // steps, minlength=QUARTERS).to(device)
-    return EpisodeMetrics(
-        error=means["error"],
-        error_by_quarter=quarters / counts,
-        leader_distance=means["leader_distance"],
-        cohesion=means["cohesion"],
-        separation=means["separation"],
-        squares={
-            name: means.squares[name] / means.count[name] for name in ("leader_distance", "cohesion", "separation")
-        },
-        min_distance=closest,
-        collision_rate=means["collision_rate"],
-        reward=means["reward"] * steps,
-        lost=leader_lost(tensordict[config.state_key][..., :3], config.comm_range),
-        diverged=diverged,
-    )
+    return episodes.result(_end_metrics(tensordict, config))
 
 
-class _Means:
-    """Running means over steps and agents, one entry a flock."""
+def _step_metrics(tensordict: TensorDictBase, config: FlockingConfig, step: int) -> dict[str, Tensor]:
+    """Metrics of a step [F] or [F, N] by name, except those of the end; the tensordict comes from ``env.step``."""
+    agents = tensordict["agents"]
+    quantities = {
+        "position": tensordict[config.state_key][..., :3],
+        "reward": tensordict["next", "agents", "reward"].squeeze(-1),
+        **{name: agents[name] for name in ("action", "expert_action", "controlled")},
+    }
+    due = [
+        name
+        for name, entry in METRICS.items()
+        if entry.options["over_time"] != "last" and step % entry.options.get("every", 1) == 0
+    ]
+    return compute_metrics(due, config, quantities)
 
-    def __init__(self, flocks: int, device: torch.device | str) -> None:
-        self.zero = torch.zeros(flocks, device=device, dtype=torch.float64)
+
+def _end_metrics(tensordict: TensorDictBase, config: FlockingConfig) -> dict[str, Tensor]:
+    """Metrics of the state after the last step [F], by name."""
+    names = [name for name, entry in METRICS.items() if entry.options["over_time"] == "last"]
+    return compute_metrics(names, config, {"position": tensordict[config.state_key][..., :3]})
+
+
+class _Accumulator:
+    """Metrics of F episodes, added up step by step; means in float64."""
+
+    def __init__(self, num_flocks: int, steps: int, device: torch.device | str) -> None:
+        self.quarter_of = (torch.arange(steps) * QUARTERS // steps).tolist()
+        self.quarters = torch.zeros(num_flocks, QUARTERS, device=device)
         self.sums: dict[str, Tensor] = {}
         self.squares: dict[str, Tensor] = {}
-        self.count: dict[str, int] = {}
+        self.counts: Counter[str] = Counter()
+        self.folded: dict[str, Tensor] = {}
 
-    def add(self, name: str, value: Tensor) -> None:
-        """Add one step's values [F] or [F, N]."""
-        value = value.double().reshape(len(value), -1)
-        self.sums[name] = self.sums.get(name, self.zero) + value.mean(-1)
-        self.squares[name] = self.squares.get(name, self.zero) + value.square().mean(-1)
-        self.count[name] = self.count.get(name, 0) + 1
+    def add(self, step: int, values: Mapping[str, Tensor]) -> None:
+        """Add the metrics of a step, each [F] or [F, N]."""
+        self.quarters[:, self.quarter_of[step]] += values["error"]
+        for name, value in values.items():
+            if fold := FOLDS.get(METRICS[name].options["over_time"]):
+                self.folded[name] = fold(self.folded[name], value) if name in self.folded else value
+                continue
+            value = value.double().reshape(len(value), -1)
+            self.sums[name] = self.sums.get(name, 0.0) + value.mean(-1)
+            self.squares[name] = self.squares.get(name, 0.0) + value.square().mean(-1)
+            self.counts[name] += 1
 
-    def __getitem__(self, name: str) -> Tensor:
-        return self.sums[name] / self.count[name]
+    def result(self, end: Mapping[str, Tensor]) -> EpisodeMetrics:
+        """The metrics of the episodes, with those of the state after the last step."""
+        means = {name: total / self.counts[name] for name, total in self.sums.items()}
+        is_sum = {name for name in means if METRICS[name].options["over_time"] == "sum"}
+        found = {name: mean * len(self.quarter_of) if name in is_sum else mean for name, mean in means.items()}
+        found |= {**self.folded, **end}
+        lengths = torch.bincount(torch.tensor(self.quarter_of), minlength=QUARTERS).to(self.quarters.device)
+        return EpisodeMetrics(
+            values={name: found[name] for name in METRICS},
+            mean_squares={name: self.squares[name] / self.counts[name] for name in means if name not in is_sum},
+            error_by_quarter=self.quarters / lengths,
+        )
 
 
 def evaluate(
@@ -221,17 +215,28 @@ def evaluate(
     expert: TensorDictModuleBase | None = None,
     watches: Mapping[str, Callable[[TensorDictBase], None]] | None = None,
 ) -> dict[str, EpisodeMetrics]:
-    """Fly each policy, and the reference policies, from the same starts; progress is shown. See `rollout`.
+    """Roll out policies and the reference policies from the same starts, and show the progress.
 
-    With an expert of one's own, the reference is it and doing nothing. ``watches``, by name of the policy, are shown
-    its rollouts.
+    Args:
+        policies: by name.
+        config: environment config.
+        num_agents: agents per flock, N.
+        num_flocks: flocks, F.
+        steps: steps per episode.
+        seed: seed of starts and leaders.
+        device: of the environments.
+        expert: see `reference_policies`.
+        watches: by name of the policy, what is called before each of its steps, see `rollout`.
+
+    Returns:
+        the metrics by name of the policy.
     """
     policies = {**policies, **reference_policies(config, expert)}
     total = len(policies) * num_flocks * steps
     rollouts = {}
     with Progress(f"evaluate, {num_agents} agents", total) as progress:
         for name, policy in policies.items():
-            progress.update(flying=name)
+            progress.update(policy=name)
             rollouts[name] = rollout(
                 policy,
                 config,

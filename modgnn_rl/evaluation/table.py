@@ -1,77 +1,81 @@
-"""The evaluation table: figures of rollouts with their spread and confidence, as JSON and as Markdown."""
+"""The evaluation table: metrics over episodes with their spread and confidence intervals, as JSON and as Markdown."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import EpisodeMetrics
 from modgnn_rl.evaluation.statistics import paired_difference, summarise
+from modgnn_rl.metrics import heading
+from modgnn_rl.registry import METRICS
 from modgnn_rl.utils.text import markdown
 
-__all__ = ["as_markdown", "read_tables", "summarise_rollouts"]
+__all__ = ["evaluation_markdown", "read_tables", "summarise_rollouts"]
 
-YARDSTICK = "LocalReynolds(hops=1)"
-SUMMARISED = ("error", "leader_distance", "cohesion", "separation", "min_distance", "collision_rate", "reward")
-ERROR_HEADER = ("flown by", "error", "median", "by quarter", "lost", "diverged")
-SHAPE_HEADER = ("flown by", "leader distance", "cohesion", "separation", "smallest", "touching", "reward")
+YARDSTICK = "local expert (1 hop)"
+ERROR_COLUMNS = ("policy", "error", "median", "by episode quarter")
 NOTE = """\
-All rows fly from the same starts behind the same leaders, each to the end. Mean ± standard deviation over flocks
-[95 % confidence interval of the mean]. Error: mean squared error of the action against the expert's, per component,
-over the agents that the policy flies, m^2/s^2; with its median over flocks and its mean in the quarters of the rollout.
-Lost: share of flocks in which nobody hears the leader at the end. Diverged: share of flocks in which an agent strayed
-beyond env.max_distance. Leader distance: from the leader to the centre of mass of the others. Cohesion: diameter of the
-smallest enclosing sphere. Separation: distance to the nearest neighbour. Smallest: the smallest distance of any two
-agents in any rollout. Touching: pairs within env.collision_distance, mean over time. Reward: of an agent, summed over
-the rollout. All distances in m."""
+All policies start from the same states and follow the same leaders; no episode ends early. Mean ± standard deviation \
+over episodes [95 % confidence interval of the mean]. Median: of the error, over episodes. By episode quarter: mean \
+error in each quarter of the episode."""
 
 
 def summarise_rollouts(rollouts: Mapping[str, EpisodeMetrics], seed: int) -> dict[str, Any]:
-    """Summarise each row's rollouts over flocks.
+    """Summarise the episodes of each policy.
 
     Args:
-        rollouts: rollouts by name of the policy, all from the same starts.
+        rollouts: by name of the policy, all from the same starts.
         seed: seed of the bootstrap.
 
     Returns:
-        for each row the mean, standard deviation, median and confidence interval of each metric over flocks, the error
-        by quarter, the standard deviations over time and flocks, the extremes, and the paired difference of its error
-        from the yardstick's.
+        for each policy, by name of the metric: the ``mean`` over episodes (the fraction if it holds or does not) and
+        their number ``n``; of a number, also ``std``, ``median`` and the confidence interval of the mean (``low``,
+        ``high``); of a mean over time, ``std_over_time``, over time, agents and episodes; of a minimum, ``min``. None
+        where the flock is too small for the metric. Besides, ``error_by_quarter``, and ``error_minus_local``, the
+        paired difference from the error of the local expert (1 hop).
     """
     rng = np.random.default_rng(seed)
     table: dict[str, Any] = {}
     for name, rollout in rollouts.items():
-        row: dict[str, Any] = {}
-        for metric in SUMMARISED:
-            values = getattr(rollout, metric).double().cpu().numpy()
-            # A flock of one has nobody that the policy flies, and no neighbour.
-            row[metric] = dataclasses.asdict(summarise(values, rng=rng)) if np.isfinite(values).all() else None
-        for metric, squares in rollout.squares.items():
-            if row[metric] is not None:
-                row[metric]["std_over_time"] = float((squares.mean() - getattr(rollout, metric).mean() ** 2).sqrt())
+        row: dict[str, Any] = {metric: _summary(rollout, metric, rng) for metric in METRICS}
         row["error_by_quarter"] = rollout.error_by_quarter.mean(0).tolist()
-        row["smallest_distance_ever"] = float(rollout.min_distance.min())
-        row["lost"] = float(rollout.lost.double().mean())
-        row["diverged"] = float(rollout.diverged.double().mean())
-        if YARDSTICK in rollouts and name != YARDSTICK:
-            mine, local = (f.error.double().cpu().numpy() for f in (rollout, rollouts[YARDSTICK]))
-            if row["error"] is not None:
-                row["error_minus_local"] = dataclasses.asdict(paired_difference(mine, local, rng=rng))
+        if YARDSTICK in rollouts and name != YARDSTICK and row["error"] is not None:
+            own, local = (episodes["error"].cpu().numpy() for episodes in (rollout, rollouts[YARDSTICK]))
+            row["error_minus_local"] = dataclasses.asdict(paired_difference(own, local, rng=rng))
         table[name] = row
     return table
 
 
+def _summary(rollout: EpisodeMetrics, metric: str, rng: np.random.Generator) -> dict[str, float] | None:
+    """What the table tells of one metric."""
+    values = rollout[metric]
+    if values.dtype == torch.bool:
+        return {"mean": float(values.double().mean()), "n": len(values)}
+    if not values.isfinite().all():  # a flock of one has no controlled agent and no neighbour
+        return None
+    found: dict[str, float] = dataclasses.asdict(summarise(values.double().cpu().numpy(), rng=rng))
+    if metric in rollout.mean_squares:
+        variance = rollout.mean_squares[metric].mean() - values.mean() ** 2
+        found["std_over_time"] = float(variance.clamp(min=0).sqrt())
+    if METRICS[metric].options["over_time"] == "min":
+        found["min"] = float(values.min())
+    return found
+
+
 def read_tables(file: Path) -> dict[str, Any]:
-    """The tables, by number of agents, that an evaluation left in a file; none where there is no such file.
+    """Read the tables of an evaluation by number of agents; none if the file does not exist.
 
     Raises:
-        InputError: the file is not what an evaluation writes.
+        InputError: an evaluation did not write the file, or it is damaged.
     """
     try:
         tables = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
@@ -80,54 +84,42 @@ def read_tables(file: Path) -> dict[str, Any]:
         raise InputError(f"{file} is not as an evaluation wrote it; delete it and evaluate again") from error
 
 
-def as_markdown(tables: Mapping[str, Any], title: str) -> str:
-    """Tables, by number of agents, as a Markdown page that also reads well on a terminal.
+def evaluation_markdown(tables: Mapping[str, Any], title: str) -> str:
+    """Tables, by number of agents, as a Markdown page that also reads well in a terminal.
 
     Args:
-        tables: for each number of agents the rollouts it was made of (``num_flocks``, ``steps``) and its ``rows``, as
-            made by `summarise_rollouts`.
+        tables: for each number of agents the rollouts (``num_flocks``, ``steps``) and the ``rows`` that
+            `summarise_rollouts` makes of them.
         title: heading of the page.
     """
+    fractions = [name for name, entry in METRICS.items() if entry.options["unit"] == "%"]
+    others = [name for name in METRICS if name not in ("error", *fractions)]
     parts = [f"# {title}"]
     for size, table in tables.items():
-        rows = table["rows"]
-        errors = [ERROR_HEADER, *([name, *_error_cells(row)] for name, row in rows.items())]
-        shapes = [SHAPE_HEADER, *([name, *_shape_cells(row)] for name, row in rows.items())]
-        parts += [
-            f"## {size} agents, {table['num_flocks']} rollouts of {table['steps']} steps",
-            markdown(errors),
-            markdown(shapes),
-        ]
-    return "\n\n".join([*parts, NOTE]) + "\n"
+        errors: list[list[str]] = [[*ERROR_COLUMNS, *map(_title, fractions)]]
+        shapes: list[list[str]] = [["policy", *map(_title, others)]]
+        for name, row in table["rows"].items():
+            errors.append([name, *_error_cells(row), *(_cell(row, metric) for metric in fractions)])
+            shapes.append([name, *(_cell(row, metric) for metric in others)])
+        head = f"## {size} agents, {table['num_flocks']} episodes of {table['steps']} steps"
+        parts += [head, markdown(errors), markdown(shapes)]
+    explained = (f"{heading(name).capitalize()}: {entry.options['about']}." for name, entry in METRICS.items())
+    note = textwrap.fill(" ".join([NOTE, *explained]), 120, break_on_hyphens=False)
+    return "\n\n".join([*parts, note]) + "\n"
+
+
+def _title(metric: str) -> str:
+    return str(METRICS[metric].options["title"])
+
+
+def _cell(row: Mapping[str, Any], metric: str) -> str:
+    entry = row.get(metric)
+    return "-" if entry is None else str(METRICS[metric].options["cell"].format(**entry))
 
 
 def _error_cells(row: Mapping[str, Any]) -> list[str]:
+    """Error, median, and error in each quarter."""
     if row["error"] is None:
-        return ["-"] * (len(ERROR_HEADER) - 1)
+        return ["-"] * 3
     quarters = " ".join(f"{value:.3f}".removeprefix("0") for value in row["error_by_quarter"])
-    shares = [f"{row[name]:.0%}" for name in ("lost", "diverged")]
-    return [_spread(row["error"], 3), f"{row['error']['median']:.3f}", quarters, *shares]
-
-
-def _shape_cells(row: Mapping[str, Any]) -> list[str]:
-    cells = [_spread(row[metric], 2) for metric in ("leader_distance", "cohesion", "separation")]
-    alone = row["min_distance"] is None
-    smallest = "-" if alone else f"{row['smallest_distance_ever']:.2f}"
-    touching = "-" if row["collision_rate"] is None else f"{row['collision_rate']['mean']:.2g}"
-    return [*cells, smallest, touching, _interval(row["reward"], 1)]
-
-
-def _spread(entry: Mapping[str, float] | None, digits: int) -> str:
-    """Mean ± standard deviation [confidence interval]."""
-    if entry is None:
-        return "-"
-    mean, std, low, high = (f"{entry[key]:.{digits}f}" for key in ("mean", "std", "low", "high"))
-    return f"{mean} ± {std} [{low}, {high}]"
-
-
-def _interval(entry: Mapping[str, float] | None, digits: int) -> str:
-    """Mean [confidence interval]."""
-    if entry is None:
-        return "-"
-    mean, low, high = (f"{entry[key]:.{digits}f}" for key in ("mean", "low", "high"))
-    return f"{mean} [{low}, {high}]"
+    return [_cell(row, "error"), f"{row['error']['median']:.3f}", quarters]
