@@ -89,7 +89,7 @@ def main(
             loss.backward()
             optimiser.step()
         test = rollout(policy, env_config, num_agents=num_agents, num_flocks=8, steps=test_steps, seed=1_000_000)
-        errors.append(test.error.mean().item())
+        errors.append(test["error"].mean().item())
         expert_flew = rollouts["expert_flies"].float().mean().item()
         print(f"round {len(errors)}: the expert flew {expert_flew:4.0%}, then error {errors[-1]:.4f} m²/s²")
         mixture.beta = SCHEDULES[schedule](len(errors))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from modgnn_rl.configs.schema import FlockingConfig
 
-__all__ = ["compute_metrics", "heading", "over_flocks"]
+__all__ = ["compute_metrics", "heading", "higher_is_better", "over_flocks"]
 
 
 def heading(name: str) -> str:
@@ -36,6 +36,11 @@ def heading(name: str) -> str:
         return name.replace("_", " ")
     title, unit = (METRICS[name].options[key] for key in ("title", "unit"))
     return f"{title} [{unit}]" if unit else str(title)
+
+
+def higher_is_better(name: str) -> bool:
+    """Whether higher values of a metric are better; of one that is not registered, such as a loss, they are not."""
+    return name in METRICS and METRICS[name].options["better"] == "higher"
 
 
 def compute_metrics(

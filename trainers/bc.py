@@ -130,4 +130,4 @@ def closed_loop_errors(
         )
         for policy in policies.values()
     ]
-    return [float(metrics.error.mean()) for metrics in rollouts]
+    return [float(metrics["error"].mean()) for metrics in rollouts]

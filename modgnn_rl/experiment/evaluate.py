@@ -13,7 +13,7 @@ from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingC
 from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.recording import FlockRecorder
 from modgnn_rl.evaluation.rollout import evaluate
-from modgnn_rl.evaluation.table import as_markdown, read_tables, summarise_rollouts
+from modgnn_rl.evaluation.table import evaluation_markdown, read_tables, summarise_rollouts
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.tracking.loading import load_policy, override_env_config
 from modgnn_rl.tracking.run_folder import RunFolder
@@ -66,8 +66,8 @@ def evaluate_policies(
     file = evaluation_file(run, changes)
     entries = sorted({**read_tables(file), **new}.items(), key=lambda entry: int(entry[0]))
     run.write(file.name, json.dumps(dict(entries), indent=2) + "\n")
-    run.write(file.with_suffix(".md").name, as_markdown(dict(entries), title))
-    print(f"\n{as_markdown(new, title)}", flush=True)
+    run.write(file.with_suffix(".md").name, evaluation_markdown(dict(entries), title))
+    print(f"\n{evaluation_markdown(new, title)}", flush=True)
     for size, recorders in replays.items():
         page = file.with_name(file.stem.replace("evaluation", f"replay-{size}", 1) + ".html")
         recordings = {name: recorder.recording() for name, recorder in recorders.items()}

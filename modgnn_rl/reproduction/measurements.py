@@ -18,6 +18,7 @@ from modgnn_rl.envs.flocking.expert import LocalReynolds
 from modgnn_rl.envs.flocking.metrics import action_error
 from modgnn_rl.evaluation.rollout import EpisodeMetrics, reference_policies, rollout
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.registry import METRICS
 from modgnn_rl.reproduction.studies import Study, Subject, World
 from modgnn_rl.reproduction.tasks import Outcome, Result
 from modgnn_rl.tracking.loading import load_policy
@@ -29,8 +30,7 @@ __all__ = ["VALIDATION", "Measurements", "flight_cell", "fly_references", "fly_s
 
 VALIDATION = "validation"  # the world of the expert's held-out rollouts
 STATES = 50  # of each held-out rollout that the validation error is taken on
-# Figures of a rollout, one a flock; the spread is that over time and agents.
-FIGURES = ("error", "leader_distance", "cohesion", "separation", "reward", "min_distance", "lost", "diverged")
+SPREADS = ("leader_distance", "cohesion", "separation")  # of which the spread over time and agents is kept, too
 
 
 def flight_cell(config: ReproduceConfig, subject: Subject, seed: int, study: Study, env_config: str) -> str:
@@ -81,8 +81,9 @@ def _fly_in(policy: TensorDictModuleBase, config: ReproduceConfig, env_config: W
 
 
 def _figures(rollouts: EpisodeMetrics) -> Result:
-    figures = {name: getattr(rollouts, name).double() for name in FIGURES}
-    for name, squares in rollouts.squares.items():
+    figures = {name: rollouts[name].double() for name in METRICS}
+    for name in SPREADS:
+        squares = rollouts.mean_squares[name]
         figures[f"{name}_square"] = squares
         figures[f"{name}_spread"] = (squares - figures[name].square()).clamp(min=0).sqrt()
     return {name: _rounded(values.tolist()) for name, values in figures.items()}

@@ -187,7 +187,7 @@ def _lost(measurements: Measurements, worlds: Mapping[str, str]) -> Table:
     flown = {heading: env_config for heading, env_config in worlds.items() if env_config != VALIDATION}
     body = []
     for row in _rows(measurements):
-        shares = [measurements.values(row, env_config, "lost") for env_config in flown.values()]
+        shares = [measurements.values(row, env_config, "leader_lost") for env_config in flown.values()]
         body.append([title_of(row), *("failed" if share is None else f"{share.mean():.0%}" for share in shares)])
     best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(flown)), "low")
     return Table("Share of flocks that lost their leader", ["model", *flown], body, "At the end.", best, REFERENCES)
@@ -252,7 +252,7 @@ def _curves(measurements: Measurements, hops: int, at: Sequence[tuple[float, str
     """A curve for each model and two references, over levels with the names of their worlds."""
     subjects = [subject for subject in measurements.study.subjects if subject.hops == hops]
     rows: dict[str, Subject | str] = {name_of(subject.model): subject for subject in subjects}
-    rows |= {"LocalReynolds": "LocalReynolds(hops=1)", "zero action": "zero action"}
+    rows |= {name: name for name in ("local expert (1 hop)", "zero action")}
     curves, unknown = {}, Estimate(np.nan, np.nan, np.nan)
     for name, row in rows.items():
         found = [_estimate(measurements, row, env_config) or unknown for _, env_config in at]

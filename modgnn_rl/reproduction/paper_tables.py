@@ -29,7 +29,7 @@ NAMES = {
     "gat": "attention",
     "mpnn": "message passing",
 }
-REFERENCES = ("expert", "LocalReynolds(hops=2)", "LocalReynolds(hops=1)", "zero action")
+REFERENCES = ("expert", "local expert (2 hops)", "local expert (1 hop)", "zero action")
 METRES = {"leader_distance": "leader distance", "cohesion": "cohesion", "separation": "separation"}
 Row = Subject | str
 
@@ -142,7 +142,7 @@ def _evaluation(measurements: Measurements, rows: Sequence[Row]) -> Table:
         for figure in METRES:
             there = paper.get(figure)
             cells += ["-" if there is None else f"{there[0]:.2f} ± {there[1]:.2f}", _spread(measurements, row, figure)]
-        body.append([*cells, _share(measurements, row, "lost")])
+        body.append([*cells, _share(measurements, row, "leader_lost")])
     caption = (
         "Rollouts of the models' own with 32 agents. Error: mean squared, against the expert's action, m²/s². Leader "
         "distance, cohesion and separation: mean ± standard deviation over time, agents and rollouts, m. Lost: "

@@ -1,4 +1,4 @@
-"""What tells runs apart: their settings, how they trained, how they fly."""
+"""Comparison of runs: settings, training, evaluation."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from typing import Any
 
 from modgnn_rl.configs.settings import flat
 from modgnn_rl.errors import InputError
+from modgnn_rl.metrics import heading
+from modgnn_rl.registry import METRICS
 from modgnn_rl.tracking.listing import next_steps, state_of
-from modgnn_rl.tracking.reader import EVALUATED, SHARES
-from modgnn_rl.tracking.summary import METRICS, RunSummary
+from modgnn_rl.tracking.summary import RunSummary, training_metrics
 from modgnn_rl.utils.text import format_duration, format_value, markdown
 
 __all__ = ["compare", "differing_settings"]
 
-UNITS = {"error": "m^2/s^2", "validation_loss": "m^2/s^2", "leader_distance": "m", "cohesion": "m", "separation": "m"}
-NOT_COMPARED = ("runs", "name", "resume")  # they say where a run is, not what it is
+NOT_COMPARED = ("runs", "name", "resume")  # where a run is, not what it is
 MISSING = "-"
 DATE = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-")
 
 
 def compare(runs: Sequence[RunSummary]) -> str:
-    """Markdown tables with a column for each run: the settings that differ, the training, the evaluation.
+    """Markdown tables with a column per run: settings that differ, training, evaluation.
 
     Args:
         runs: two or more.
 
     Raises:
-        InputError: there are fewer.
+        InputError: fewer than two runs.
     """
     if len(runs) < 2:
         raise InputError(f"{len(runs)} run cannot be compared: give two or more, as in compare=[dagger-gcn,bc-gcn]")
@@ -43,10 +43,10 @@ def compare(runs: Sequence[RunSummary]) -> str:
 def differing_settings(runs: Sequence[RunSummary]) -> dict[str, list[Any]]:
     """The settings in which runs differ, by their dotted names.
 
-    Those of one trainer alone count where they differ between runs of that trainer.
+    A setting that only one trainer has is compared between the runs of that trainer.
 
     Returns:
-        the value in each run, ``-`` where there is no such setting.
+        the value in each run, ``-`` if the run has no such setting.
     """
     leaves = [flat(run.config) for run in runs]
     trainers = [settings.get("trainer.name") for settings in leaves]
@@ -61,7 +61,7 @@ def differing_settings(runs: Sequence[RunSummary]) -> dict[str, list[Any]]:
 
 
 def _training(runs: Sequence[RunSummary]) -> list[list[str]]:
-    """How runs stand, and their metrics."""
+    """State and training metrics of runs."""
     rows = [
         ["state", *map(state_of, runs)],
         ["started", *(f"{run.started:%Y-%m-%d %H:%M:%S}" if run.started else MISSING for run in runs)],
@@ -69,44 +69,40 @@ def _training(runs: Sequence[RunSummary]) -> list[list[str]]:
         ["last round", *map(_round, runs)],
         ["speed", *(f"{format_value(run.speed)} {run.unit}/s" if run.speed else MISSING for run in runs)],
     ]
-    for metric in METRICS:
-        best = [run.best if run.aim == metric else None for run in runs]
+    for metric in training_metrics():
+        best = [run.best if run.objective == metric else None for run in runs]
         rows += [
-            [f"{_title(metric)}: last", *(format_value(run.last.get(metric)) for run in runs)],
-            [f"{_title(metric)}: mean of the last 5", *(format_value(run.recent.get(metric)) for run in runs)],
-            [f"{_title(metric)}: best mean of 5", *map(format_value, best)],
+            [f"{heading(metric)}: last", *(format_value(run.last.get(metric)) for run in runs)],
+            [f"{heading(metric)}: mean of the last 5", *(format_value(run.recent.get(metric)) for run in runs)],
+            [f"{heading(metric)}: best mean of 5", *map(format_value, best)],
         ]
     return [row for row in rows if set(row[1:]) != {MISSING}]
 
 
 def _round(run: RunSummary) -> str:
-    """The last round of how many."""
+    """The last round, and of how many."""
     return (
         MISSING if run.round is None else " of ".join(str(part) for part in (run.round, run.rounds) if part is not None)
     )
 
 
 def _evaluation(runs: Sequence[RunSummary]) -> list[list[str]]:
-    """The rows of the evaluation tables side by side; means with confidence intervals."""
+    """The rows of the evaluation tables side by side: means with confidence intervals, and fractions."""
     rows = []
     for flock in dict.fromkeys(flock for run in runs for flock in run.evaluations):
         found = [run.evaluations.get(flock) for run in runs]
         rows.append(
-            [flock, *(f"{row['num_flocks']} rollouts of {row['steps']} steps" if row else MISSING for row in found)]
+            [flock, *(f"{row['num_flocks']} episodes of {row['steps']} steps" if row else MISSING for row in found)]
         )
-        rows += [[_title(metric), *(_interval(row and row[metric]) for row in found)] for metric in EVALUATED]
-        rows += [[share, *(f"{row[share]:.0%}" if row else MISSING for row in found)] for share in SHARES]
+        rows += [[heading(metric), *(_mean(row and row[metric]) for row in found)] for metric in METRICS]
     return rows
 
 
-def _title(metric: str) -> str:
-    """The name of a metric with its unit."""
-    return metric.replace("_", " ") + (f", {UNITS[metric]}" if metric in UNITS else "")
-
-
-def _interval(spread: dict[str, float] | None) -> str:
-    """Mean [confidence interval]."""
-    return f"{spread['mean']:.3g} [{spread['low']:.3g}, {spread['high']:.3g}]" if spread else MISSING
+def _mean(entry: dict[str, float] | None) -> str:
+    """Mean [confidence interval], or a fraction in percent."""
+    if entry is None:
+        return MISSING
+    return "{mean:.3g} [{low:.3g}, {high:.3g}]".format(**entry) if "low" in entry else f"{entry['mean']:.0%}"
 
 
 def _as_text(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""A list of runs: how each stands, with its main figures."""
+"""A list of runs with their state and main metrics."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ import textwrap
 from collections.abc import Callable, Collection, Sequence
 from datetime import datetime
 
-from modgnn_rl.tracking.summary import METRICS, RunSummary
+from modgnn_rl.metrics import higher_is_better
+from modgnn_rl.tracking.summary import RunSummary, training_metrics
 from modgnn_rl.utils.text import aligned, format_duration, format_value, markdown, printable
 
 __all__ = ["list_runs", "next_steps", "sort_key", "state_of"]
 
-ENDED = ("stopped", "killed", "failed")  # before their time
+ENDED_EARLY = ("stopped", "killed", "failed")
 LABELS = {"validation_loss": "loss"}
-LESS_IMPORTANT = ("speed", "age", "took", "leader", "best")  # columns that go where there is no room, in this order
+LESS_IMPORTANT = ("speed", "age", "took", "leader", "best")  # columns to leave out if there is no room, in this order
 SHORTEST_NAME = 24
 LEGEND = (
-    "took: time trained; last: error of the actions on own rollouts (m^2/s^2), loss on held-out rollouts, or "
-    "reward of a "
-    "step, in the last round; best: its best mean over 5 rounds; eval.: error in the evaluation; leader: distance from "
-    "the leader there, m"
+    "took: training time; last: the trainer's objective in the last round (error on the policy's rollouts, m²/s², "
+    "validation loss, or reward per step); best: its best mean over 5 rounds; eval.: error in the evaluation, m²/s²; "
+    "leader: leader distance in the evaluation, m"
 )
 
 
 def list_runs(runs: Sequence[RunSummary], width: int | None = None) -> str:
-    """A table with a row for each run, what is wrong with some, and what to do next.
+    """A table with a row per run, the problems of some, and what to do next.
 
     Args:
         runs: in the order of the rows.
-        width: where there is less room, columns go and names are shortened; default: all, as Markdown.
+        width: columns are left out and names shortened to fit; default: everything, as Markdown.
     """
     if not runs:
-        return "No runs to list.\nNext: python -m modgnn_rl.train begins one"
+        return "No runs to list.\nNext: python -m modgnn_rl.train starts one"
     rows = [row for run in runs for row in (run, *run.policies)]
     columns = _columns({policy.path for run in runs for policy in run.policies})
     cells = {header: [header, *map(cell, rows)] for header, cell in columns.items()}
@@ -57,7 +57,7 @@ def list_runs(runs: Sequence[RunSummary], width: int | None = None) -> str:
 
 
 def _next_looks(runs: Sequence[RunSummary]) -> list[str]:
-    """What to do with the last of those that are finished."""
+    """What to do with the last finished runs."""
     finished = list(dict.fromkeys(run.run for run in runs if run.state == "finished"))
     if len(finished) > 1:
         return [f"Next: python -m modgnn_rl.runs {shlex.quote(f'compare=[{finished[-2]},{finished[-1]}]')}"]
@@ -65,28 +65,27 @@ def _next_looks(runs: Sequence[RunSummary]) -> list[str]:
 
 
 def sort_key(run: RunSummary, sort: str) -> tuple[float, str]:
-    """What runs are sorted by, so that the newest, the longest or the best is last; first those of which it is unknown.
+    """Key that sorts the newest, longest or best run last, and runs without the value first.
 
     Args:
         run: a run.
-        sort: as `modgnn_rl.configs.schema.RunsConfig` lists it.
+        sort: see `modgnn_rl.configs.schema.RunsConfig`.
     """
     if sort in ("started", "updated"):
         time = run.started if sort == "started" else run.updated
         rank = time.timestamp() if time else None
     elif sort == "seconds":
         rank = run.seconds
-    elif sort == "reward":
-        rank = run.last.get(sort)
     else:
-        error = _evaluated(run, "error") if sort == "evaluation" else run.last.get(sort)
-        rank = None if error is None else -error
+        rank = _evaluated(run, "error") if sort == "evaluation" else run.last.get(sort)
+        if rank is not None and not higher_is_better(sort):
+            rank = -rank
     return -math.inf if rank is None else rank, run.path.name
 
 
 def next_steps(runs: Sequence[RunSummary]) -> list[str]:
-    """How to go on with the last of those that ended before their time."""
-    ended = list(dict.fromkeys(run.run for run in runs if run.state in ENDED))
+    """How to resume the last of the runs that ended early."""
+    ended = list(dict.fromkeys(run.run for run in runs if run.state in ENDED_EARLY))
     if not ended:
         return []
     others = [f"{len(ended) - 1} more can be resumed like this."] if len(ended) > 1 else []
@@ -94,12 +93,16 @@ def next_steps(runs: Sequence[RunSummary]) -> list[str]:
 
 
 def state_of(run: RunSummary) -> str:
-    """The state, with how much is done of what is not finished."""
-    return f"{run.state} {run.share:.0%}" if run.share is not None and run.state in ("training", *ENDED) else run.state
+    """The state, with the progress of a run that is not finished."""
+    return (
+        f"{run.state} {run.share:.0%}"
+        if run.share is not None and run.state in ("training", *ENDED_EARLY)
+        else run.state
+    )
 
 
 def _columns(policies: Collection[object]) -> dict[str, Callable[[RunSummary], str]]:
-    """The cells of a row by header; what several policies have in common stands in their run's row only."""
+    """The cells of a row by header; what several policies share is in the row of their run only."""
 
     def shared(cell: Callable[[RunSummary], str]) -> Callable[[RunSummary], str]:
         return lambda run: "" if run.path in policies else cell(run)
@@ -110,7 +113,7 @@ def _columns(policies: Collection[object]) -> dict[str, Callable[[RunSummary], s
         "state": shared(state_of),
         "age": shared(lambda run: format_duration((now - run.updated).total_seconds() if run.updated else None)),
         "took": shared(lambda run: format_duration(run.seconds)),
-        "last": _last_figure,
+        "last": _last_value,
         "best": lambda run: format_value(run.best),
         "eval.": lambda run: format_value(_evaluated(run, "error")),
         "leader": lambda run: format_value(_evaluated(run, "leader_distance")),
@@ -118,14 +121,14 @@ def _columns(policies: Collection[object]) -> dict[str, Callable[[RunSummary], s
     }
 
 
-def _last_figure(run: RunSummary) -> str:
-    """The last figure of what the trainer aims at, or of what else there is."""
-    metric = next((name for name in (run.aim, *METRICS) if name in run.last), None)
+def _last_value(run: RunSummary) -> str:
+    """The last value of the trainer's objective, or of another metric if there is none."""
+    metric = next((name for name in (run.objective, *training_metrics()) if name in run.last), None)
     return "-" if metric is None else f"{LABELS.get(metric, metric)} {format_value(run.last[metric])}"
 
 
 def _evaluated(run: RunSummary, metric: str) -> float | None:
-    """The mean of a metric in rollouts of the size and in the world trained on; of another size if there are none."""
+    """Mean of a metric in the evaluation at the size and in the environment of training, else at another size."""
     tables = [table for size in run.sizes if (table := run.evaluations.get(f"{size} agents"))]
     tables += [table for name, table in run.evaluations.items() if "," not in name]
     spread = tables[0][metric] if tables else None
@@ -133,10 +136,10 @@ def _evaluated(run: RunSummary, metric: str) -> float | None:
 
 
 def _excess(cells: dict[str, list[str]], width: int) -> int:
-    """By how much a table is too wide."""
+    """By how many characters a table is too wide."""
     return sum(max(map(len, column)) + 2 for column in cells.values()) - 2 - width
 
 
 def _shortened(name: str, length: int) -> str:
-    """A name without its middle: it begins with the date and ends with what the run is called."""
+    """A name without its middle: it begins with a date and ends with the name of the run."""
     return name if len(name) <= length else f"{name[: length // 3]}...{name[len(name) - (length - length // 3 - 3) :]}"

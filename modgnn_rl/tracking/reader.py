@@ -1,4 +1,4 @@
-"""Reading the files of a run folder that may be damaged, somebody else's, or written to meanwhile.
+"""Read the files of a run folder that may be damaged, owned by someone else, or being written to.
 
 Nothing is written, and torch is not imported.
 """
@@ -14,11 +14,11 @@ from typing import Any
 
 import yaml
 
+from modgnn_rl.metrics import higher_is_better
+from modgnn_rl.registry import METRICS
 from modgnn_rl.tracking.run_folder import SCHEMA_VERSION
 
 __all__ = [
-    "EVALUATED",
-    "SHARES",
     "as_dict",
     "as_number",
     "as_time",
@@ -29,17 +29,14 @@ __all__ = [
     "written_at",
 ]
 
-EVALUATED = ("error", "leader_distance", "cohesion", "separation", "reward")
-SHARES = ("lost", "diverged")
-SPREAD = ("mean", "low", "high")
-TAIL = 25  # lines of metrics.jsonl that are read, so that what is not measured in each round is among them
+TAIL = 25  # lines of metrics.jsonl to read, enough to include metrics that are not logged in every round
 BLOCK = 1 << 16  # bytes
 
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # OmegaConf's own needs seconds for fifty runs
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # OmegaConf's own loader takes seconds for fifty runs
 
 
 def read_config(file: Path) -> dict[str, Any]:
-    """Read a stored configuration, or raise a ValueError that says in a few words why that cannot be."""
+    """Read a stored configuration; raise a ValueError that says in a few words why that is impossible."""
     try:
         config = yaml.load(file.read_text(encoding="utf-8"), _Loader)
     except FileNotFoundError as error:
@@ -57,7 +54,7 @@ def read_config(file: Path) -> dict[str, Any]:
 
 
 def last_records(file: Path, count: int = TAIL) -> list[dict[str, Any]]:
-    """The last lines of a metrics file, oldest first; a line that is being written, or was cut, is left out."""
+    """Records of the last lines of a metrics file, oldest first, without lines that are incomplete."""
     try:
         with file.open("rb") as stream:
             size, length = stream.seek(0, os.SEEK_END), BLOCK
@@ -81,43 +78,48 @@ def last_records(file: Path, count: int = TAIL) -> list[dict[str, Any]]:
     return records[-count:]
 
 
-def read_best(folder: Path, aim: str) -> float | None:
-    """The score of the best policy, turned back into the metric: of scores the lowest is the best."""
+def read_best(folder: Path, objective: str) -> float | None:
+    """The objective of the best policy, from its score, which is the metric with a sign such that lower is better."""
     for file in sorted(folder.glob("step_*/state.json"), reverse=True):
         try:
             score = as_number(as_dict(json.loads(file.read_text(encoding="utf-8"))).get("score"))
-        except (OSError, ValueError):  # a better one takes its place
+        except (OSError, ValueError):  # a better one is just replacing it
             continue
-        return score if score is None or aim != "reward" else -score
+        return -score if score is not None and higher_is_better(objective) else score
     return None
 
 
-def read_evaluation(file: Path, row: str) -> dict[str, dict[str, Any]]:
-    """One row of the tables in a file of evaluations, by the number of agents and the changes of the world.
+def read_evaluation(file: Path, policy: str) -> dict[str, dict[str, Any]]:
+    """One policy's row of each table that an evaluation has written to a file.
+
+    Returns:
+        for each table, named by its number of agents and the changes to the environment, as in ``32 agents, wind=1``:
+        ``num_flocks``, ``steps``, and by name of the metric its mean over the episodes with, unless it is a fraction,
+        the ends of the confidence interval ``low`` and ``high``; None if the metric does not apply.
 
     Raises:
-        OSError, ValueError, TypeError, KeyError, AttributeError: the file is not as an evaluation writes it.
+        OSError, ValueError, TypeError, KeyError, AttributeError: an evaluation did not write the file.
     """
     tables = json.loads(file.read_text(encoding="utf-8"))
     changes = file.stem.removeprefix("evaluation").removeprefix("-")
-    found = {}
+    found: dict[str, dict[str, Any]] = {}
     for size, table in tables.items():
-        if row in table["rows"]:
-            figures = table["rows"][row]
-            spreads = {metric: figures[metric] for metric in EVALUATED}  # null in a flock of one
-            found[f"{int(size)} agents" + (f", {changes}" if changes else "")] = {
-                **{
-                    metric: spread and {key: float(spread[key]) for key in SPREAD} for metric, spread in spreads.items()
-                },
-                **{share: float(figures[share]) for share in SHARES},
-                "num_flocks": int(table["num_flocks"]),
-                "steps": int(table["steps"]),
-            }
+        if policy in table["rows"]:
+            row = {metric: _interval(table["rows"][policy].get(metric)) for metric in METRICS}
+            counts = {key: int(table[key]) for key in ("num_flocks", "steps")}
+            found[f"{int(size)} agents" + (f", {changes}" if changes else "")] = {**row, **counts}
     return found
 
 
+def _interval(entry: dict[str, Any] | None) -> dict[str, float] | None:
+    """Mean and ends of the confidence interval of an entry of a table."""
+    if entry is None:
+        return None
+    return {key: float(entry[key]) for key in ("mean", "low", "high") if key == "mean" or key in entry}
+
+
 def written_at(file: Path) -> datetime | None:
-    """When a file was last written to."""
+    """When a file was last written to; None if there is no such file."""
     try:
         return datetime.fromtimestamp(file.stat().st_mtime).astimezone()
     except OSError:
@@ -125,12 +127,12 @@ def written_at(file: Path) -> datetime | None:
 
 
 def as_dict(value: Any) -> dict[str, Any]:
-    """A dict that is one, or an empty one."""
+    """The value if it is a dict, else an empty one."""
     return value if isinstance(value, dict) else {}
 
 
 def as_number(value: Any) -> float | None:
-    """A number that is one, or nothing."""
+    """The value as a float if it is a finite number, else None."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:
@@ -140,7 +142,7 @@ def as_number(value: Any) -> float | None:
 
 
 def as_time(value: Any) -> datetime | None:
-    """A point in time as ``status.json`` gives it, or nothing."""
+    """The time that an entry of ``status.json`` gives, or None."""
     try:
         return datetime.fromisoformat(value).astimezone()
     except (TypeError, ValueError, OverflowError):

@@ -1,6 +1,6 @@
-"""What the plain files of a run folder say of the run, read without torch and without writing anything.
+"""The state and metrics of a run from the plain files of its folder, read without torch and without writing anything.
 
-`modgnn_rl.runs` shows it. A folder may belong to somebody else, be written to meanwhile, or be damaged.
+For `modgnn_rl.runs`. The folder may belong to someone else, be written to meanwhile, or be damaged.
 """
 
 from __future__ import annotations
@@ -26,37 +26,34 @@ from modgnn_rl.tracking.reader import (
 )
 from modgnn_rl.tracking.run_folder import RunFolder
 
-__all__ = ["METRICS", "RunSummary", "find_runs", "summarise_run"]
+__all__ = ["RunSummary", "find_runs", "summarise_run", "training_metrics"]
 
-METRICS = ("error", "reward", "validation_loss", "loss")
-RECENT = 5  # numbers that are averaged
-DEPTH = 3  # folders, for sweeps and groups of runs
+RECENT = 5  # values that are averaged
+DEPTH = 3  # levels of folders, for sweeps and groups of runs
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """How a run stands, or one of several policies that a run trains side by side.
+    """Summary of a run, or of one of several policies that a run trains side by side.
 
     Attributes:
-        name: of the folder, below the folder that was searched.
+        name: name of the folder, relative to the folder that was searched.
         path: the folder.
-        run: the folder of the run, which for one of several policies is another.
-        problem: what could not be read; empty where all could.
-        config: the settings; empty where they cannot be read.
-        state: as `modgnn_rl.tracking.run_folder.RunFolder.state`; ``unreadable`` without settings.
-        reason: why it ended before its time.
-        started, updated: when it began, and when it was last heard of.
-        seconds: how long it has trained, s; if it does not train any more, until its last checkpoint.
-        round, rounds: number of the last round, and of the last that is planned where that is a setting.
-        share: how much of the training is done, 0 to 1; if it does not train any more, in its last checkpoint.
-        speed, unit: what it does in a second, and of what.
-        last: the last number of each of `METRICS`, averaged over the sizes trained on.
-        recent: the mean of its last 5 numbers.
-        aim: the metric that the best policy is the best in.
-        best: its value then, a mean over 5 rounds.
-        evaluations: the policy's row of each evaluation table, by the number of agents and the changes of the world, as
-            in ``32 agents, wind=1``: `EVALUATED` with mean and confidence interval, `SHARES`, and of how many rollouts
-            and steps (``num_flocks``, ``steps``) they are.
+        run: folder of the run; differs from ``path`` for one of several policies.
+        problem: what could not be read; empty if nothing.
+        config: the settings; empty if they cannot be read.
+        state: see `modgnn_rl.tracking.run_folder.RunFolder.state`; ``unreadable`` without settings.
+        reason: why the run ended early.
+        started, updated: when it began, and when it last wrote.
+        seconds: training time so far, s; of a run that has ended, until its last checkpoint.
+        round, rounds: number of the last round, and the planned number of rounds if that is a setting.
+        share: fraction of the training that is done, 0 to 1; of a run that has ended, in its last checkpoint.
+        speed, unit: units of work per second, and the unit.
+        last: last value of each of `training_metrics`, averaged over the sizes trained on.
+        recent: mean of its last 5 values.
+        objective: the metric in which the best policy is the best.
+        best: its value for the best policy, a mean over 5 rounds.
+        evaluations: the policy's rows in the evaluation tables, see `modgnn_rl.tracking.reader.read_evaluation`.
         policies: each of several policies.
     """
 
@@ -77,39 +74,45 @@ class RunSummary:
     unit: str = "updates"
     last: dict[str, float] = field(default_factory=dict)
     recent: dict[str, float] = field(default_factory=dict)
-    aim: str = ""
+    objective: str = ""
     best: float | None = None
     evaluations: dict[str, dict[str, Any]] = field(default_factory=dict)
     policies: tuple[RunSummary, ...] = ()
 
     @property
     def sizes(self) -> list[Any]:
-        """The numbers of agents trained on."""
+        """The numbers of agents in training."""
         return as_list(as_dict(self.config.get("env")).get("num_agents"))
 
 
+def training_metrics() -> tuple[str, ...]:
+    """Names of the metrics that training is judged by: the trainers' objectives, and the loss."""
+    known = filter(None, map(TRAINERS.peek, TRAINERS))  # an installed package is not imported for this
+    return tuple(dict.fromkeys([*filter(None, (entry.options.get("objective") for entry in known)), "loss"]))
+
+
 def find_runs(root: Path, depth: int = DEPTH) -> list[Path]:
-    """The run folders in a folder, damaged ones too, or the folder itself if it is one.
+    """The run folders in a folder, including damaged ones, or the folder itself if it is one.
 
     Args:
         root: where to look.
-        depth: how many folders deep.
+        depth: how many levels of folders to search.
     """
     try:
         if any((root / name).is_file() for name in ("config.yaml", "status.json", "metrics.jsonl")):
             return [root]
         folders = sorted(path for path in root.iterdir() if path.is_dir()) if depth > 0 else []
-    except OSError:  # not ours to look into
+    except OSError:  # no permission
         return []
     return [run for folder in folders for run in find_runs(folder, depth - 1)]
 
 
 def summarise_run(path: Path, name: str | None = None) -> RunSummary:
-    """Read how a run stands; what cannot be read is left out and named in ``problem``.
+    """Summarise a run; what cannot be read is left out and named in ``problem``.
 
     Args:
         path: the run folder.
-        name: what to call it; default: the name of the folder.
+        name: its name in lists; default: the name of the folder.
     """
     name = name or path.absolute().name
     try:
@@ -119,25 +122,25 @@ def summarise_run(path: Path, name: str | None = None) -> RunSummary:
     run = RunFolder(path, config)
     records = last_records(run.metrics_file)
     trainer = str(as_dict(config.get("trainer")).get("name"))
-    aim = TRAINERS[trainer].option("objective", "") if trainer in TRAINERS else ""
-    summary = RunSummary(name, path, path, config=config, aim=aim, **_standing(run, records))
+    objective = TRAINERS[trainer].options.get("objective", "") if trainer in TRAINERS else ""
+    summary = RunSummary(name, path, path, config=config, objective=objective, **_standing(run, records))
     policies = _policies(records[-1]) if records else []
     return dataclasses.replace(
-        _with_figures(summary, records),
+        _with_metrics(summary, records),
         policies=tuple(_summarise_policy(summary, policy, records) for policy in policies),
     )
 
 
 def _standing(run: RunFolder, records: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Those attributes of a summary that say how far a run is."""
+    """The attributes of a summary that tell how far the run is."""
     status, trainer = run.status, as_dict(run.config.get("trainer"))
     state, updated = run.state, as_time(status.get("updated"))
     done, total, seconds = (as_number(status.get(key)) for key in ("done", "total", "seconds"))
     speed = done / seconds if done and seconds else None
     step = as_number(records[-1].get("step")) if records else None
-    rounds = as_number(trainer.get("rounds", trainer.get("iterations")))
+    rounds = as_number(trainer.get("rounds"))
     shares = [(done, total)]
-    if state == "training":  # status.json tells of the last checkpoint, metrics.jsonl of the last round
+    if state == "training":  # status.json knows the last checkpoint, metrics.jsonl the last round
         shares.append((step, rounds))
         written = written_at(run.metrics_file)
         if updated and written and written > updated:
@@ -146,7 +149,9 @@ def _standing(run: RunFolder, records: Sequence[dict[str, Any]]) -> dict[str, An
     parts = [part / whole for part, whole in shares if part is not None and whole]
     return {
         "state": state,
-        "reason": str(status.get("reason", "")) if state in ("stopped", "failed") else "",  # it stays in status.json
+        "reason": str(status.get("reason", ""))
+        if state in ("stopped", "failed")
+        else "",  # status.json keeps an old one
         "started": as_time(status.get("started")),
         "updated": updated,
         "seconds": seconds,
@@ -159,25 +164,25 @@ def _standing(run: RunFolder, records: Sequence[dict[str, Any]]) -> dict[str, An
 
 
 def _summarise_policy(run: RunSummary, policy: str, records: Sequence[dict[str, Any]]) -> RunSummary:
-    """One of several policies of a run; its own folder is whole only when the run has ended."""
+    """Summarise one of several policies of a run; its own folder is complete only once the run has ended."""
     path = run.path / policy
     try:
         config = read_config(path / "config.yaml")
     except ValueError:
         config = run.config
-    return _with_figures(
+    return _with_metrics(
         dataclasses.replace(run, name=f"{run.name}/{policy}", path=path, config=config), records, policy
     )
 
 
-def _with_figures(summary: RunSummary, records: Sequence[dict[str, Any]], policy: str = "") -> RunSummary:
-    """Add what was measured of the run's policy, or of one of several."""
-    numbers = {metric: _numbers(records, metric, policy) for metric in METRICS}
-    measured = {metric: found for metric, found in numbers.items() if found}
+def _with_metrics(summary: RunSummary, records: Sequence[dict[str, Any]], policy: str = "") -> RunSummary:
+    """Add the metrics of the run's policy, or of one of several."""
+    found = {metric: _values(records, metric, policy) for metric in {*training_metrics(), summary.objective}}
+    logged = {metric: values for metric, values in found.items() if values}
     model = str(as_dict(summary.config.get("model")).get("name"))
     folders = [(summary.path, model)]
     if policy:
-        folders.insert(0, (summary.path.parent, policy))  # where the run flew all of them
+        folders.insert(0, (summary.path.parent, policy))  # the run evaluates all of them together
     evaluations: dict[str, dict[str, Any]] = {}
     problems = []
     for folder, row in folders:
@@ -189,21 +194,21 @@ def _with_figures(summary: RunSummary, records: Sequence[dict[str, Any]], policy
     return dataclasses.replace(
         summary,
         problem=", ".join(problems),
-        last={metric: found[-1] for metric, found in measured.items()},
-        recent={metric: sum(found[-RECENT:]) / len(found[-RECENT:]) for metric, found in measured.items()},
-        best=read_best(summary.path / "best", summary.aim),
+        last={metric: values[-1] for metric, values in logged.items()},
+        recent={metric: sum(values[-RECENT:]) / len(values[-RECENT:]) for metric, values in logged.items()},
+        best=read_best(summary.path / "best", summary.objective),
         evaluations=evaluations,
     )
 
 
 def _policies(record: dict[str, Any]) -> list[str]:
-    """The names of several policies trained side by side, which begin the names of their metrics."""
+    """The names of policies trained side by side, with which the names of their metrics begin."""
     heads = [key.removesuffix("/validation_loss").rpartition("/") for key in record if key.endswith("/validation_loss")]
     return list(dict.fromkeys(head for head, _, _ in heads if head))
 
 
-def _numbers(records: Sequence[dict[str, Any]], metric: str, policy: str) -> list[float]:
-    """A metric of a policy in those records that have it, the mean over the sizes."""
+def _values(records: Sequence[dict[str, Any]], metric: str, policy: str) -> list[float]:
+    """A metric of a policy in the records that have it, averaged over the sizes."""
     found = []
     for record in records:
         values = [record[metric]] if not policy and metric in record else _by_size(record, metric, policy)

@@ -77,7 +77,7 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
         assert f"5/{name}" in metrics[-1]
     assert list(run.checkpoints.iterdir())
     table = json.loads((run.path / "evaluation.json").read_text())["5"]["rows"]
-    rows = ["moment_force", "expert", "LocalReynolds(hops=2)", "LocalReynolds(hops=1)", "zero action"]
+    rows = ["moment_force", "expert", "local expert (2 hops)", "local expert (1 hop)", "zero action"]
     assert list(table) == rows
     assert all(row in (run.path / "evaluation.md").read_text() for row in rows)
 

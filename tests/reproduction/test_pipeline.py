@@ -72,7 +72,7 @@ def test_the_references_have_the_errors_that_they_must_have(reproduction):
     measured = Measurements(outcome, config, study)
     for env_config in (VALIDATION, "N32"):
         expert, local, idle = (
-            measured.values(name, env_config, "error") for name in ("expert", "LocalReynolds(hops=1)", "zero action")
+            measured.values(name, env_config, "error") for name in ("expert", "local expert (1 hop)", "zero action")
         )
         assert expert.max() == 0
         assert (idle <= config.env.max_speed**2 / 3 + 1e-6).all()

@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, MAPPOConfig, RunsConfig, TrainConfig
 from modgnn_rl.errors import InputError
+from modgnn_rl.registry import METRICS
 from modgnn_rl.runs import find_run, show_runs
 from modgnn_rl.tracking import reader
 from modgnn_rl.tracking.comparison import compare, differing_settings
@@ -50,8 +51,8 @@ def write_evaluation(run, rows, sizes=(8,), changes=""):
 
     def row(error):
         spread = {"mean": error, "std": 0.1, "median": error, "low": error - 0.1, "high": error + 0.1, "n": 5}
-        metrics = ("error", "leader_distance", "cohesion", "separation", "reward")
-        return {**dict.fromkeys(metrics, spread), "lost": 0.25, "diverged": 0.0}
+        fractions = {name for name, entry in METRICS.items() if entry.options["unit"] == "%"}
+        return {name: {"mean": 0.25, "n": 5} if name in fractions else spread for name in METRICS}
 
     flown = {"num_flocks": 5, "steps": 40, "seed": 0}
     tables = {str(size): {**flown, "rows": {name: row(error) for name, error in rows.items()}} for size in sizes}
@@ -291,11 +292,9 @@ def test_a_comparison_is_markdown_with_a_column_for_each_run(tmp_path):
     text = compare([summarise_run(run.path) for run in (first, second)])
     rows = [line for line in text.splitlines() if line.startswith("|")]
     assert {line.count("|") for line in rows} == {4}
-    assert [line.split("|")[2].strip() for line in rows if " error, m^2/s^2 " in line] == ["0.5 [0.4, 0.6]"] * 2
-    assert [line.split("|")[3].strip() for line in rows if " error, m^2/s^2 " in line] == ["-", "0.75 [0.65, 0.85]"]
-    assert (
-        next(line.split("|")[2].strip() for line in rows if "| error, m^2/s^2: mean of the last 5 " in line) == "0.36"
-    )
+    assert [line.split("|")[2].strip() for line in rows if " error [m²/s²] " in line] == ["0.5 [0.4, 0.6]"] * 2
+    assert [line.split("|")[3].strip() for line in rows if " error [m²/s²] " in line] == ["-", "0.75 [0.65, 0.85]"]
+    assert next(line.split("|")[2].strip() for line in rows if "| error [m²/s²]: mean of the last 5 " in line) == "0.36"
     assert text.endswith(f"resume={second.path}")
     assert "Settings that differ" not in text  # they do not
 
@@ -344,7 +343,7 @@ def test_the_command_needs_no_torch_and_heeds_a_closed_pipe(tmp_path):
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
         show_runs(RunsConfig(runs=str(tmp_path / "missing")))
-    assert show_runs(RunsConfig(runs=str(tmp_path))).endswith("python -m modgnn_rl.train begins one")
+    assert show_runs(RunsConfig(runs=str(tmp_path))).endswith("python -m modgnn_rl.train starts one")
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def cloned(tmp_path_factory):
 
 def _scores(policy):
     rollouts = rollout(policy, WORLD, num_agents=4, num_flocks=3, steps=12, seed=5)
-    return torch.cat((rollouts.error, rollouts.reward, rollouts.cohesion))
+    return torch.cat((rollouts["error"], rollouts["reward"], rollouts["cohesion"]))
 
 
 def test_training_begins_with_exactly_the_policy_of_the_other_run(cloned, tmp_path):

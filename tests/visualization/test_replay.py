@@ -138,7 +138,7 @@ def test_the_page_loads_nothing_and_escapes_names(tmp_path):
 
 @pytest.mark.slow
 def test_two_rollouts_of_32_agents_and_1000_steps_take_less_than_a_megabyte(tmp_path):
-    env_config, names = FlockingConfig(), ("expert", "LocalReynolds(hops=1)")
+    env_config, names = FlockingConfig(), ("expert", "local expert (1 hop)")
     policies = reference_policies(env_config)
     rollouts = {name: record(policies[name], env_config, num_agents=32, steps=1000, seed=5) for name in names}
     html.write_replay(tmp_path / "replay.html", rollouts, "two rollouts")

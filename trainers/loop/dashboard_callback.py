@@ -1,4 +1,4 @@
-"""What dashboards show beyond metrics: reference policies, actions, videos, and the final table."""
+"""What dashboards show of a training beyond its metrics: reference lines, actions, videos, the evaluation table."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from tensordict.nn import TensorDictModuleBase
 from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
 from modgnn_rl.errors import one_line
 from modgnn_rl.evaluation.recording import record
-from modgnn_rl.evaluation.rollout import EpisodeMetrics, reference_policies, rollout
+from modgnn_rl.evaluation.rollout import reference_policies, rollout
+from modgnn_rl.metrics import over_flocks
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.registry import METRICS, TRAINERS
 from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
@@ -24,21 +26,21 @@ from modgnn_rl.visualization.video import VIDEO_STRIDE, check_video, write_video
 __all__ = ["DashboardCallback", "log_evaluation"]
 
 STEPS = 200  # of a reference rollout and of a video
-FLOCKS = 4  # of 32 agents; larger flocks are fewer
-CHART_ROUNDS = 10  # rounds after which reference lines are extended
+FLOCKS = 4  # of 32 agents; fewer if there are more agents
+CHART_ROUNDS = 10  # rounds between two points of a reference line
 MAX_ACTIONS = 30_000  # components in a histogram
 
 
 class DashboardCallback(Callback):
-    """Shows on dashboards the metrics of reference policies, the distribution of the actions, and videos.
+    """Logs the metrics of the reference policies, histograms of actions, and videos to dashboards.
 
-    Training is bitwise the same with and without it. A part that fails is turned off, with one warning.
+    Training is bit-equal with and without it. What fails is left out from then on, with one warning.
 
     Args:
-        config: the run's settings.
-        run: the run folder; videos go into ``videos/`` there.
-        loggers: the dashboards.
-        expert: the policy to imitate; default: Reynolds flocking.
+        config: settings of the run.
+        run: the run folder; videos go to its ``videos/``.
+        loggers: dashboards to log to.
+        expert: the policy's teacher; default: Reynolds flocking.
     """
 
     def __init__(
@@ -50,105 +52,109 @@ class DashboardCallback(Callback):
     ) -> None:
         self.config, self.run, self.loggers, self.expert = config, run, loggers, expert
         self.policies: Mapping[str, ModGNN] = {}
-        self.lines: dict[str, dict[str, float]] = {}  # of each metric: the value of each reference policy
-        self.shown: set[str] = set()  # metrics with lines
+        self.references: dict[str, dict[str, float]] = {}  # by metric, then by reference policy
+        self.shown: set[str] = set()  # metrics with reference lines
         self.last = self.last_video = 0  # rounds
         self._failed: set[str] = set()
 
     def on_start(self, policies: Mapping[str, ModGNN]) -> None:
-        """Roll out the reference policies, and check whether videos can be made."""
+        """Roll out the reference policies, and check that videos can be made."""
         self.policies = policies
         self._attempt("reference rollouts", self._roll_out_references)
         if self._makes_videos:
             self._attempt("videos", check_video)
 
     def on_collect(self, index: int, rollouts: TensorDictBase) -> None:
-        """Show a histogram of the components of the actions (m/s)."""
-        self._attempt("actions", lambda: self._show_actions(index, rollouts))
+        """Log a histogram of the components of the actions, m/s."""
+        self._attempt("actions", lambda: self._log_actions(index, rollouts))
 
     def on_round(self, index: int, metrics: Mapping[str, float]) -> None:
-        """Extend the reference lines and make a video, when it is time for them."""
-        found = {name for name in metrics if self._line(name) in self.lines}
+        """Extend the reference lines, and make a video, if it is time to."""
+        found = {name for name in metrics if self._reference_of(name) in self.references}
         is_time = index % CHART_ROUNDS == 0 or not found <= self.shown
         self.shown |= found
         self.last = index
         if is_time:
-            self._attempt("reference lines", self._draw_lines)
+            self._attempt("reference lines", self._log_references)
         if self._makes_videos and index and index % self.config.video_rounds == 0:
-            self._attempt("videos", self._make_video)
+            self._attempt("videos", self._log_video)
 
     def on_end(self, policies: Mapping[str, ModGNN]) -> None:
-        """Extend the reference lines to the end, and make a video of the final policy."""
+        """Extend the reference lines to the last round, and make a video of the final policy."""
         if self.last % CHART_ROUNDS:
-            self._attempt("reference lines", self._draw_lines)
+            self._attempt("reference lines", self._log_references)
         if self._makes_videos and self.last_video != self.last:
-            self._attempt("videos", self._make_video)
+            self._attempt("videos", self._log_video)
 
     @property
     def _makes_videos(self) -> bool:
         return self.config.video_rounds > 0 and self.loggers.shows_videos
 
+    @property
+    def _steps(self) -> int:
+        return min(STEPS, self.config.env.max_steps)
+
     def _attempt(self, what: str, action: Callable[[], Any]) -> None:
-        """Do something that must neither stop the training nor affect its random numbers."""
+        """Run what must neither stop the training nor touch its random numbers."""
         if what in self._failed or not self.loggers:
             return
         try:
             with seeded(derive_seed(self.config.seed, "watching"), self.config.device):
                 action()
-        except Exception as error:  # whatever is missing, training continues
+        except Exception as error:  # whatever a dashboard lacks, training continues
             self._failed.add(what)
             warnings.warn(
-                f"dashboards show no {what} from now on ({one_line(error)}); training continues",
+                f"dashboards no longer show {what} ({one_line(error)}); training continues",
                 RuntimeWarning,
                 stacklevel=3,
             )
 
     def _roll_out_references(self) -> None:
-        """Measure the reference policies at each flock size."""
+        """Log a table of the reference policies' metrics for each size, and keep them for the lines."""
         env_config = self.config.env
         for size in env_config.sizes:
             rows = {
-                name: _measures(
-                    rollout(
-                        policy,
-                        env_config,
-                        num_agents=size,
-                        num_flocks=max(1, FLOCKS * REFERENCE_SIZE // size),
-                        steps=self._steps,
-                        seed=derive_seed(self.config.seed, "references", size),
-                        device=self.config.device,
-                        expert=self.expert,
-                    ),
-                    self._steps,
-                )
+                name: self._reference_metrics(policy, size)
                 for name, policy in reference_policies(env_config, self.expert).items()
             }
-            measures = list(next(iter(rows.values())))
-            self.lines |= {f"{size}/{name}": {who: row[name] for who, row in rows.items()} for name in measures}
-            table: list[list[str | float]] = [[who, *row.values()] for who, row in rows.items()]
-            self.loggers.log_table(f"references/{size}", ["flown by", *measures], table)
-        for name in ("error", "reward"):
-            lines = [self.lines[f"{size}/{name}"] for size in env_config.sizes]
-            self.lines[name] = {who: sum(line[who] for line in lines) / len(lines) for who in lines[0]}
+            for name in METRICS:
+                self.references[f"{size}/{name}"] = {policy: row[name] for policy, row in rows.items()}
+            table: list[list[str | float]] = [[policy, *row.values()] for policy, row in rows.items()]
+            self.loggers.log_table(f"references/{size}", ["policy", *METRICS], table)
+        for name in {entry.option("objective") for entry in TRAINERS.values()} & set(METRICS):
+            lines = [self.references[f"{size}/{name}"] for size in env_config.sizes]
+            self.references[name] = {policy: sum(line[policy] for line in lines) / len(lines) for policy in lines[0]}
 
-    @property
-    def _steps(self) -> int:
-        return min(STEPS, self.config.env.max_steps)
+    def _reference_metrics(self, policy: TensorDictModuleBase, size: int) -> dict[str, float]:
+        """Metrics of a reference policy, by name; like those of a trainer's rollouts, sums are per step."""
+        episodes = rollout(
+            policy,
+            self.config.env,
+            num_agents=size,
+            num_flocks=max(1, FLOCKS * REFERENCE_SIZE // size),
+            steps=self._steps,
+            seed=derive_seed(self.config.seed, "references", size),
+            device=self.config.device,
+            expert=self.expert,
+        )
+        steps = {name: self._steps if entry.options["over_time"] == "sum" else 1 for name, entry in METRICS.items()}
+        return {name: over_flocks(name, episodes[name]) / steps[name] for name in METRICS}
 
-    def _line(self, metric: str) -> str:
-        """The name of a metric in `lines`, without the name of a policy before it."""
-        return metric if metric in self.lines else "/".join(metric.split("/")[-2:])
+    def _reference_of(self, metric: str) -> str:
+        """The name in ``references`` of a metric, whose own name may begin with a policy's."""
+        return metric if metric in self.references else "/".join(metric.split("/")[-2:])
 
-    def _draw_lines(self) -> None:
-        self.loggers.log_references(self.last, {name: self.lines[self._line(name)] for name in sorted(self.shown)})
+    def _log_references(self) -> None:
+        lines = {name: self.references[self._reference_of(name)] for name in sorted(self.shown)}
+        self.loggers.log_references(self.last, lines)
 
-    def _show_actions(self, index: int, rollouts: TensorDictBase) -> None:
+    def _log_actions(self, index: int, rollouts: TensorDictBase) -> None:
         actions = rollouts["agents", "action"][rollouts["agents", "controlled"]].flatten()
         size = rollouts["agents", "action"].shape[-2]
         self.loggers.log_histogram(index, f"{size}/actions", actions[:: max(1, len(actions) // MAX_ACTIONS)])
 
-    def _make_video(self) -> None:
-        """Make a video of the first policy at the first size, always from the same start, for comparison."""
+    def _log_video(self) -> None:
+        """Log a video of the first policy at the first size, always from the same start so that videos compare."""
         env_config, folder = self.config.env, self.run.path / "videos"
         size = env_config.sizes[0]
         recording = record(
@@ -168,29 +174,17 @@ class DashboardCallback(Callback):
         self.loggers.log_video(self.last, f"{size}/rollout", path)
 
 
-def _measures(rollouts: EpisodeMetrics, steps: int) -> dict[str, float]:
-    """Metrics of rollouts by the names that `rollout_metrics` gives them."""
-    names = ("error", "leader_distance", "cohesion", "separation", "collision_rate", "lost", "diverged")
-    means = {name: float(getattr(rollouts, name).double().mean()) for name in names}
-    smallest, reward = float(rollouts.min_distance.min()), float(rollouts.reward.mean()) / steps
-    return {**means, "min_distance": smallest, "reward": reward}
-
-
 def log_evaluation(loggers: LoggerGroup, tables: Mapping[int, Mapping[str, Any]]) -> None:
-    """Show the evaluation on loggers, a table for each number of agents.
+    """Log the evaluation to dashboards, one table for each number of agents.
 
     Args:
-        loggers: where.
+        loggers: dashboards to log to.
         tables: by number of agents, as `modgnn_rl.evaluation.table.summarise_rollouts` makes them.
     """
-    means = ("error", "leader_distance", "cohesion", "separation", "collision_rate", "reward")
-    plain = ("smallest_distance_ever", "lost", "diverged")
-    columns = ["flown by", "error", "error, low", "error, high", *means[1:], *plain]
     for size, table in tables.items():
-        rows = []
-        for name, row in table.items():
-            error, *others = (row[mean] or {} for mean in means)
-            figures = [error.get(key, math.nan) for key in ("mean", "low", "high")]
-            figures += [other.get("mean", math.nan) for other in others]
-            rows.append([name, *figures, *(float(row[name]) for name in plain)])
-        loggers.log_table(f"evaluation/{size}", columns, rows)
+        rows: list[list[str | float]] = []
+        for policy, row in table.items():
+            cells = {name: row[name] or {} for name in METRICS}
+            values = [cell.get("min", cell.get("mean", math.nan)) for cell in cells.values()]
+            rows.append([policy, *values, *(cells["error"].get(end, math.nan) for end in ("low", "high"))])
+        loggers.log_table(f"evaluation/{size}", ["policy", *METRICS, "error, low", "error, high"], rows)

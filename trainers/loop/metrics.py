@@ -8,16 +8,10 @@ import torch
 from tensordict import TensorDictBase
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.flocking.metrics import (
-    action_error,
-    cohesion,
-    is_diverged,
-    leader_distance,
-    leader_lost,
-    min_distance,
-    separation,
-)
+from modgnn_rl.envs.flocking.metrics import action_error
 from modgnn_rl.envs.flocking.rewards import flocking_costs
+from modgnn_rl.metrics import compute_metrics, over_flocks
+from modgnn_rl.registry import METRICS
 from modgnn_rl.utils.tensors import pair_distances
 
 __all__ = ["mean_over_sizes", "reward_metrics", "rollout_metrics"]
@@ -44,18 +38,12 @@ def rollout_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dic
     error = action_error(agents.get("loc", agents["action"]), agents["expert_action"], counted).nanmean()
     frames = torch.linspace(0, rollouts.shape[1] - 1, FRAMES).long()
     position = rollouts[env_config.state_key][:, frames, :, :3]
-    measured = {
-        "error": error,
-        "leader_distance": leader_distance(position).mean(),
-        "cohesion": cohesion(position).mean(),
-        "separation": separation(position).mean(),
-        "min_distance": min_distance(position).min(),
-        "lost": leader_lost(position, env_config.comm_range).double().mean(),
-        "diverged": is_diverged(position, env_config.max_distance).double().mean(),
-    }
+    of_positions = [name for name, entry in METRICS.items() if "inputs" not in entry.options]
+    values = compute_metrics(of_positions, env_config, {"position": position})
+    measured = {"error": float(error)} | {name: over_flocks(name, value) for name, value in values.items()}
     if expert_acts is not None:
-        measured["expert_fraction"] = expert_acts.double().mean()
-    return {f"{position.shape[-2]}/{name}": float(value) for name, value in measured.items()}
+        measured["expert_fraction"] = float(expert_acts.double().mean())
+    return {f"{position.shape[-2]}/{name}": value for name, value in measured.items()}
 
 
 def reward_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dict[str, float]:

@@ -20,6 +20,7 @@ from modgnn_rl.configs.schema import (
 from modgnn_rl.evaluation.rollout import reference_policies, rollout
 from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
+from modgnn_rl.registry import METRICS
 from modgnn_rl.tracking.backends import Dashboard
 from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
@@ -121,20 +122,19 @@ def test_training_is_the_same_to_the_last_bit(tmp_path, name, monkeypatch):
     assert (plain.path / "metrics.jsonl").read_bytes() == (watched.path / "metrics.jsonl").read_bytes()
 
 
-def test_the_final_table_is_a_table():
+def test_the_evaluation_is_logged_as_a_table_of_all_metrics():
     recorder = Recorder()
-    figures = {"mean": 1.0, "low": 0.5, "high": 2.0, "std": 3.0}
-    names = ("error", "leader_distance", "cohesion", "separation", "collision_rate", "reward")
-    row = {name: {**figures, "mean": float(number)} for number, name in enumerate(names)}
-    row |= {"smallest_distance_ever": 7, "lost": 0.1, "diverged": 0.2}
-    alone = row | {"error": None}  # a flock of one has nobody that the policy flies
-    log_evaluation(LoggerGroup({"recorder": lambda: recorder}), {8: {"mine": row, "alone": alone}})
-    columns, rows = recorder.tables["evaluation/8"]
-    assert columns[:4] == ["flown by", "error", "error, low", "error, high"]
-    assert rows[0] == ["mine", 0.0, 0.5, 2.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 0.1, 0.2]
-    assert len(columns) == len(rows[0])
-    assert all(math.isnan(value) for value in rows[1][1:4])
-    assert rows[1][4:] == rows[0][4:]
+    row = {name: {"mean": float(number), "low": 0.5, "high": 2.0} for number, name in enumerate(METRICS)}
+    row["min_distance"]["min"] = 7.0
+    small = row | {"error": None}  # a flock of one has no controlled agent
+    log_evaluation(LoggerGroup({"recorder": lambda: recorder}), {8: {"mine": row, "small": small}})
+    columns, (mine, other) = recorder.tables["evaluation/8"]
+    assert columns == ["policy", *METRICS, "error, low", "error, high"]
+    means = {name: float(number) for number, name in enumerate(METRICS)} | {"min_distance": 7.0}
+    assert mine == ["mine", *means.values(), 0.5, 2.0]
+    cells = dict(zip(columns, other, strict=True))
+    assert all(math.isnan(cells[name]) for name in ("error", "error, low", "error, high"))
+    assert [cells[name] for name in list(METRICS)[1:]] == list(means.values())[1:]
 
 
 def test_reference_lines_are_those_of_the_reference_flights(watch):
@@ -143,26 +143,28 @@ def test_reference_lines_are_those_of_the_reference_flights(watch):
     for size in (4, 5):
         columns, rows = recorder.tables[f"references/{size}"]
         assert [row[0] for row in rows] == list(reference_policies(env_config))
-        assert dict(zip(columns, rows[-1], strict=True))["error"] == watch.lines[f"{size}/error"]["zero action"] > 0
+        assert (
+            dict(zip(columns, rows[-1], strict=True))["error"] == watch.references[f"{size}/error"]["zero action"] > 0
+        )
     watch.on_round(1, {"4/error": 0.5, "pair_force-K1/5/cohesion": 3.0, "error": 0.5, "4/loss": 0.1})
     ((step, lines),) = recorder.references
     assert step == 1
     assert set(lines) == {"4/error", "pair_force-K1/5/cohesion", "error"}
     assert lines["error"]["zero action"] == pytest.approx(
-        sum(watch.lines[f"{size}/error"]["zero action"] for size in (4, 5)) / 2
+        sum(watch.references[f"{size}/error"]["zero action"] for size in (4, 5)) / 2
     )
     assert lines["4/error"]["expert"] == 0
     seed = dashboard_callback.derive_seed(watch.config.seed, "references", 5)
     expert = reference_policies(env_config)["expert"]
     rollouts = rollout(expert, env_config, num_agents=5, num_flocks=1, steps=6, seed=seed)
-    assert lines["pair_force-K1/5/cohesion"]["expert"] == float(rollouts.cohesion.mean())
+    assert lines["pair_force-K1/5/cohesion"]["expert"] == float(rollouts["cohesion"].mean())
 
 
 def test_lines_are_drawn_on_each_tenth_round_for_new_metrics_and_at_the_end(watch):
     watch, recorder = watch
     watch.config.video_rounds = 0
     for index in range(1, 24):
-        watch.on_round(index, {"4/error": 0.5} | ({"4/lost": 0.0} if index > 12 else {}))
+        watch.on_round(index, {"4/error": 0.5} | ({"4/leader_lost": 0.0} if index > 12 else {}))
     watch.on_end({})
     assert [step for step, _ in recorder.references] == [1, 10, 13, 20, 23]
 
@@ -216,7 +218,7 @@ def test_what_fails_is_left_out_with_one_warning(watch, monkeypatch):
     with pytest.warns(RuntimeWarning) as caught:
         go_on()
     assert [str(warning.message) for warning in caught] == [
-        "dashboards show no videos from now on (no room); training continues"
+        "dashboards no longer show videos (no room); training continues"
     ]
     assert recorder.references
 
@@ -230,6 +232,6 @@ def test_missing_packages_are_said_once(tmp_path, monkeypatch):
         for index in range(1, 41):
             watch.on_round(index, {})
 
-    with pytest.warns(RuntimeWarning, match="no videos from now on .*pip install av matplotlib") as caught:
+    with pytest.warns(RuntimeWarning, match="no longer show videos .*pip install av matplotlib") as caught:
         use()
     assert len(caught) == 1
