@@ -1,7 +1,7 @@
-"""The expert that policies learn from, and what it could do with a policy's own eyes.
+"""The expert that policies learn from, Reynolds flocking, with global and with local information.
 
-`reynolds` is the paper's rule as a plain function. `Reynolds` flies it over all agents; `LocalReynolds` restricts it to
-what a decentralised policy can see, and is the yardstick for such policies.
+`reynolds` is the paper's rule as a plain function. `Reynolds` applies it to all agents. `LocalReynolds` restricts it to
+the information of a decentralised policy, and is the reference for such policies.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from modgnn_rl.utils.tensors import clip_to_ball, is_transformed, pair_blocks, p
 
 __all__ = ["LocalReynolds", "Reynolds", "reynolds"]
 
-SOFTENING = 1e-6  # m^2 (and m^2/s^2): keeps the rule finite when two agents meet
+SOFTENING = 1e-6  # m^2 (and m^2/s^2): keeps the rule finite when two agents coincide
 
 
 def reynolds(
@@ -45,7 +45,7 @@ def reynolds(
 
         u_i = sum over visible j of  C_c p |p|  -  C_s p / |p|^3  +  C_a v |v|
 
-    Pairs are worked on in blocks that fit a cache, except where shapes must not depend on data.
+    Pairs are processed in blocks that fit the cache, except in transformed code, where shapes must not depend on data.
 
     Args:
         position: m [..., N, 3].
@@ -54,23 +54,24 @@ def reynolds(
         separation: weight C_s.
         alignment: weight C_a.
         max_speed: radius of the action ball, m/s.
-        visible: whom an agent sees. Entry i, j says that i sees j, bool [..., N, N]; or links, int64 [..., 2, E]: those
-            seen, and below them those that see, filled up with -1. Default: everybody.
-        mask: agents that are there, bool [..., N]; the others neither see nor are seen. Default: all. What is not seen
-            may be NaN.
+        visible: which agents each agent sees: bool [..., N, N], whose entry i, j says that i sees j; or edges, int64
+            [..., 2, E], with the agents seen in the first row and those that see them in the second, padded with -1.
+            Default: all see all.
+        mask: agents that are present, bool [..., N]; the others neither see nor are seen. Default: all. Values of
+            agents that are not seen may be NaN.
 
     Returns:
         target velocity, m/s [..., N, 3].
 
     Raises:
-        InputError: on links of agents that do not exist.
+        InputError: an edge has an agent that does not exist.
     """
     gains = (cohesion, separation, alignment)
     *batch, agents, _ = position.shape
     state = [value.reshape(-1, agents, 3) for value in (position, velocity)]
     mask = None if mask is None else mask.expand(*batch, agents).reshape(-1, agents)
     if visible is not None and visible.dtype == torch.int64:
-        force = _forces_over_links(state, Topology(visible, agents, mask=mask, form="links").all_edges(), gains)
+        force = _forces_over_edges(state, Topology(visible, agents, mask=mask, form="links").all_edges(), gains)
     else:
         seen = None if visible is None else visible.expand(*batch, agents, agents).reshape(-1, agents, agents)
         force = _forces_of_pairs(state, seen, mask, gains)
@@ -80,14 +81,14 @@ def reynolds(
 def _forces_of_pairs(
     state: list[Tensor], visible: Tensor | None, mask: Tensor | None, gains: tuple[float, float, float]
 ) -> Tensor:
-    """The sum of the rule over all pairs, or the visible ones, bool [B, N, N], of those in the mask; [B * N, 3]."""
+    """The rule summed over all pairs, or the visible ones, bool [B, N, N], of agents in the mask; [B * N, 3]."""
     everything = slice(0, state[0].shape[0]), slice(0, state[0].shape[1])
     parts = []
     for some, receivers in [everything] if is_transformed() else pair_blocks(state[0]):
         seen = None if visible is None else visible[some, receivers]
         if mask is not None:
-            there = mask[some].unsqueeze(-2) & mask[some, receivers].unsqueeze(-1)
-            seen = there if seen is None else seen & there
+            present = mask[some].unsqueeze(-2) & mask[some, receivers].unsqueeze(-1)
+            seen = present if seen is None else seen & present
         offset, drift = (pair_differences(value[some], receivers) for value in state)
         force = _pair_forces(offset, drift, gains)
         if seen is not None:
@@ -96,16 +97,16 @@ def _forces_of_pairs(
     return torch.cat(parts)
 
 
-def _forces_over_links(state: list[Tensor], links: Graph, gains: tuple[float, float, float]) -> Tensor:
-    """The sum of the rule over links; [B * N, 3]."""
+def _forces_over_edges(state: list[Tensor], edges: Graph, gains: tuple[float, float, float]) -> Tensor:
+    """The rule summed over edges; [B * N, 3]."""
     nodes = [value.flatten(0, 1) for value in state]
-    offset, drift = (links.gather_senders(node) - links.gather_receivers(node) for node in nodes)
+    offset, drift = (edges.gather_senders(node) - edges.gather_receivers(node) for node in nodes)
     force = _pair_forces(offset.t().contiguous().unbind(), drift.t().contiguous().unbind(), gains)
-    return links.scatter_sum(torch.stack(force, -1))
+    return edges.scatter_sum(torch.stack(force, -1))
 
 
 def _pair_forces(offset: Sequence[Tensor], drift: Sequence[Tensor], gains: tuple[float, float, float]) -> list[Tensor]:
-    """The terms of the sum, by component, for pairs whose positions and velocities differ by so much, by component."""
+    """The terms of the sum by component, from the components of differences of positions and of velocities."""
     cohesion, separation, alignment = gains
     square = squared_norm(offset) + SOFTENING
     distance = square.sqrt()
@@ -123,9 +124,9 @@ class Reynolds(TensorDictModuleBase):
         alignment: weight C_a.
         max_speed: radius of the action ball, m/s.
         observation: key of the states (position, velocity) [..., N, 6].
-        mask: key of the agents that are there, bool [..., N], read where there is one; nobody sees the others.
-        action: key that the expert's action [..., N, 3] is written to.
-        compile: compile the rule.
+        mask: key of the agents that are present, bool [..., N], if there is one; the others are not seen.
+        action: key of the expert's action [..., N, 3].
+        compile: whether to compile the rule.
     """
 
     def __init__(
@@ -153,14 +154,14 @@ class Reynolds(TensorDictModuleBase):
 
     @classmethod
     def for_env(cls, config: FlockingConfig, **options: Any) -> Self:
-        """The expert of a flocking world, with that world's gains; it sees the true states."""
+        """Create the expert with the gains of an environment; it reads the true states."""
         return cls(**{**_gains_of(config), "observation": config.state_key, **options})
 
     def rule(
         self, position: Tensor, velocity: Tensor, visible: Tensor | None = None, mask: Tensor | None = None
     ) -> Tensor:
-        """The target velocities, m/s [..., N, 3], see `reynolds`."""
-        # The number of links in a list is not known to a compiler.
+        """Target velocities, m/s [..., N, 3], see `reynolds`."""
+        # The number of edges in a list depends on data, which a compiler cannot handle.
         rule = self._rule if visible is None or visible.dtype == torch.bool else reynolds
         return rule(position, velocity, visible=visible, mask=mask, **self.gains)
 
@@ -171,28 +172,28 @@ class Reynolds(TensorDictModuleBase):
 
 
 class LocalReynolds(Reynolds):
-    """Reynolds flocking with the eyes of a decentralised policy.
+    """Reynolds flocking with the information of a decentralised policy.
 
-    At time t an agent sees the agents within ``hops`` links of the graph of t, as they and it were at t - 1; at the
-    first step of an episode it has heard of nobody and stays where it is, and so does one that comes (back). It keeps
-    the last observation under ``cache`` as recurrent state.
+    At time t an agent knows the agents within ``hops`` edges in the graph of time t, with all observations, including
+    its own, from t - 1. At the first step of an episode, or after a dropout, it knows no agent, and its target velocity
+    is zero. The last observation is kept under ``cache`` as recurrent state.
 
     Args:
         cohesion: weight C_c.
         separation: weight C_s.
         alignment: weight C_a.
         max_speed: radius of the action ball, m/s.
-        hops: links over which an agent hears of others.
+        hops: number of edges over which information travels.
         observation: key of the observations (position, velocity) [..., N, 6].
-        adjacency: key of the adjacency [..., N, N], or of lists of links, int64 [..., 2, E].
-        is_init: key of the flag that an episode begins [..., 1].
-        mask: key of the agents that are there, bool [..., N], read where there is one.
+        adjacency: key of the adjacency [..., N, N], or of edge lists, int64 [..., 2, E].
+        is_init: key of the flag that an episode starts [..., 1].
+        mask: key of the agents that are present, bool [..., N], if there is one.
         cache: key of the last observation [..., N, 6].
-        action: key that the action [..., N, 3] is written to.
-        compile: compile the rule.
+        action: key of the action [..., N, 3].
+        compile: whether to compile the rule.
 
     Raises:
-        InputError: on ``hops`` below 1 or fractional.
+        InputError: ``hops`` is not a positive integer.
     """
 
     def __init__(
@@ -215,7 +216,7 @@ class LocalReynolds(Reynolds):
             cohesion, separation, alignment, max_speed, observation=observation, action=action, compile=compile
         )
         if not isinstance(hops, int) or hops < 1:
-            raise InputError(f"hops={hops!r} is not a number of links to hear over; expected an integer of at least 1")
+            raise InputError(f"hops={hops!r} is not a positive integer")
         self.hops = hops
         self.cache = cache
         self.in_keys = [observation, adjacency, is_init, cache, mask]
@@ -223,28 +224,28 @@ class LocalReynolds(Reynolds):
 
     @classmethod
     def for_env(cls, config: FlockingConfig, **options: Any) -> Self:
-        """The local rule of a flocking world, with that world's gains; it sees what a policy observes."""
+        """Create the local expert with the gains of an environment; it reads what a policy observes."""
         return cls(**{**_gains_of(config), **options})
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action [..., N, 3] and the observation to remember [..., N, 6]."""
+        """Write the action [..., N, 3] and the observation for the next step [..., N, 6]."""
         observation, adjacency = (tensordict[key] for key in self.in_keys[:2])
         is_init, last, mask = (tensordict.get(key, None) for key in self.in_keys[2:])
         last = missing(observation) if last is None else last
         if is_init is not None:
             last = torch.where(is_init.unsqueeze(-1), torch.nan, last)
-        heard = ~last.isnan().any(-1)
+        known = ~last.isnan().any(-1)
         if mask is not None:
-            heard = heard & mask
+            known = known & mask
             observation = torch.where(mask.unsqueeze(-1), observation, torch.nan)
         visible = adjacency
         if adjacency.dtype != torch.int64 or self.hops > 1:
             visible = reachable(as_matrix(adjacency, observation.shape[-2]), self.hops)
-        action = self.rule(last[..., :3], last[..., 3:], visible, heard)
+        action = self.rule(last[..., :3], last[..., 3:], visible, known)
         return tensordict.set(self.out_keys[0], action).set(self.out_keys[1], observation)
 
     def make_tensordict_primer(self) -> RecurrentStatePrimer:
-        """The transform that gives an environment this module's recurrent state."""
+        """The transform that adds this module's recurrent state to an environment."""
         return RecurrentStatePrimer(self, [self.cache], is_init=self.in_keys[2])
 
 

@@ -13,11 +13,11 @@ __all__ = ["smallest_enclosing_sphere"]
 
 _PAIRS = tuple(combinations(range(4), 2))
 _TRIPLES = tuple(combinations(range(4), 3))
-# The subsets of (four support points, new point 4) that hold the new point, padded to four with the new point.
+# Subsets of (four support points, new point 4) that contain the new point, padded to four with the new point.
 _SUBSETS = tuple((*chosen, *[4] * (4 - len(chosen))) for size in (1, 2, 3) for chosen in combinations(range(4), size))
 _TOLERANCE = 1e-13  # on squared distances; the points are scaled so that the radius lies between 1 and sqrt(3)
-_MAX_ROUNDS = 100  # 14 at most were seen; a guard against cycling through rounding errors
-_BLOCK = 2048  # point sets handled together, so that the candidates stay in cache
+_MAX_ROUNDS = 100  # at most 14 occurred in tests; prevents endless cycles by rounding errors
+_BLOCK = 2048  # point sets processed together, so that the candidates fit the cache
 
 
 @torch.no_grad()
@@ -26,8 +26,8 @@ def smallest_enclosing_sphere(points: Tensor) -> tuple[Tensor, Tensor]:
 
     Starting from one point, each round adds the point farthest from the centre to the at most four points that support
     the sphere and replaces the sphere by the smallest one around these five, which is the circumsphere of one of the
-    14 subsets that hold the new point. It grows until no point lies outside. All arithmetic is in float64, and the
-    radius is the measured distance to the farthest point, so the sphere encloses whatever the rounding.
+    14 subsets that contain the new point. This repeats until no point lies outside. All arithmetic is in float64. The
+    radius is the computed distance to the farthest point, so the sphere encloses all points despite rounding.
 
     Args:
         points: ``[*B, N, 3]``, N at least 1; any floating dtype and unit. Duplicate, collinear, planar and co-spherical
@@ -35,7 +35,7 @@ def smallest_enclosing_sphere(points: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Centre ``[*B, 3]`` and radius ``[*B]``, in the dtype and unit of ``points`` and without gradient. A set with a
-        coordinate that is not finite has NaN for both.
+        coordinate that is NaN or infinite has NaN for both.
 
     Raises:
         InputError: ``points`` does not end in ``[N, 3]`` with N at least 1.
@@ -55,7 +55,7 @@ def smallest_enclosing_sphere(points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _centres(points: Tensor) -> Tensor:
-    """Return the centres ``[S, 3]`` of the smallest spheres around ``points`` ``[S, N, 3]``, scaled to about 1."""
+    """Return the centres ``[S, 3]`` of the smallest spheres around ``points`` ``[S, N, 3]`` of size about 1."""
     centres = points[:, 0].clone()
     rows = torch.arange(len(points), device=points.device)
     support = points[:, :1].expand(-1, 4, -1)
@@ -84,8 +84,8 @@ def _grow(support: Tensor, newest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     offsets = support - newest
     candidates = _circumcentres(offsets)
     five = torch.cat([offsets, torch.zeros_like(newest)], 1)
-    # Comparing how far each centre must reach to hold all five points needs no tolerance, and a flat subset or one
-    # that does not support the sphere can only lose.
+    # Comparing the radii with which each centre encloses all five points needs no tolerance; a flat subset or one that
+    # does not support the sphere cannot have the smallest.
     reach = (candidates[:, :, None] - five[:, None]).square().sum(-1).amax(-1).nan_to_num(torch.inf)
     squared_radius, best = reach.min(-1)
     kept = torch.tensor(_SUBSETS, device=support.device)[best]
@@ -100,7 +100,7 @@ def _circumcentres(offsets: Tensor) -> Tensor:
         offsets: ``[S, 4, 3]``.
 
     Returns:
-        ``[S, 14, 3]``, in the order of ``_SUBSETS``; of no use (NaN, infinite or far off) where the subset is flat.
+        ``[S, 14, 3]``, in the order of ``_SUBSETS``; meaningless (NaN, infinite or far away) where the subset is flat.
     """
     squared = offsets.square().sum(-1, keepdim=True)
     i, j = zip(*_PAIRS, strict=True)

@@ -1,4 +1,4 @@
-"""Triangle meshes of what is drawn of a flock, as arrays [T, 3, 3]: triangles, their corners, coordinates."""
+"""Triangle meshes of a flock's parts, as arrays [T, 3, 3]: triangles, corners, coordinates."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> A
 
 
 def _ring(radius: float, height: float, sides: int) -> Array:
-    """Points of a regular polygon about the z axis [sides, 3]."""
+    """Corners of a regular polygon around the z axis [sides, 3]."""
     angle = np.arange(sides) * 2 * np.pi / sides
     return np.stack((radius * np.cos(angle), radius * np.sin(angle), np.full(sides, height)), -1)
 
 
 def _cone(radius: float, bottom: float, top: float, sides: int) -> Array:
-    """A cone about the z axis, with its base."""
+    """A cone around the z axis, with its base."""
     ring = _ring(radius, bottom, sides)
     following = np.roll(ring, -1, 0)
     tip, centre = (np.broadcast_to((0.0, 0.0, height), ring.shape) for height in (top, bottom))
@@ -34,14 +34,14 @@ def _cone(radius: float, bottom: float, top: float, sides: int) -> Array:
 
 
 def _tube(radius: float, bottom: float, top: float, sides: int) -> Array:
-    """The side of a cylinder about the z axis."""
+    """The lateral surface of a cylinder around the z axis."""
     low, high = _ring(radius, bottom, sides), _ring(radius, top, sides)
     low_next, high_next = np.roll(low, -1, 0), np.roll(high, -1, 0)
     return np.concatenate((np.stack((low, low_next, high_next), 1), np.stack((low, high_next, high), 1)))
 
 
 def _quadcopter() -> Array:
-    """Two crossed bars and four rotors, the arms being 1 long."""
+    """Two crossed bars and four rotors; the arms have length 1."""
     half = np.sqrt(0.5)
     diagonal = np.array(((half, -half, 0), (half, half, 0), (0, 0, 1)))
     bars = np.concatenate((_box((-1, -0.1, -0.08), (1, 0.1, 0.08)), _box((-0.1, -1, -0.08), (0.1, 1, 0.08))))
@@ -58,14 +58,14 @@ def normals(mesh: Array) -> Array:
 
 
 def quaternions_along(vectors: Array) -> Array:
-    """Quaternions x, y, z, w [K, 4] that turn the z axis into the direction of vectors [K, 3]."""
+    """Quaternions x, y, z, w [K, 4] that rotate the z axis into the direction of vectors [K, 3]."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     length = np.sqrt(x * x + y * y + z * z)
-    half_turn = np.stack((-y, x, np.zeros_like(z), length + z), -1)  # its length is twice a half angle's cosine
+    half_turn = np.stack((-y, x, np.zeros_like(z), length + z), -1)  # its length is twice the cosine of half the angle
     norm = np.linalg.norm(half_turn, axis=-1, keepdims=True)
     down = norm <= 1e-9 * np.maximum(length, 1e-30)[:, None]
     return np.where(down, (1.0, 0.0, 0.0, 0.0), half_turn / np.where(down, 1.0, norm))
 
 
 QUADCOPTER = _quadcopter()
-ARROW = np.concatenate((_tube(1.0, 0.0, 0.75, 8), _cone(2.4, 0.72, 1.0, 8)))  # along z, 1 long
+ARROW = np.concatenate((_tube(1.0, 0.0, 0.75, 8), _cone(2.4, 0.72, 1.0, 8)))  # along the z axis, with length 1
