@@ -63,7 +63,8 @@ def test_links_lead_to_the_folders_that_setuptools_maps(folder: str) -> None:
 def test_package_data_covers_every_file_that_is_not_code() -> None:
     covered = {
         path
-        for package, patterns in SETUPTOOLS["package-data"].items()
+        for key, patterns in SETUPTOOLS["package-data"].items()
+        for package in (SETUPTOOLS["packages"] if key == "*" else [key])
         for pattern in patterns
         for path in (ROOT / "modgnn_rl" / Path(*package.split(".")[1:])).glob(pattern)
     }

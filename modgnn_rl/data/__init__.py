@@ -1,1 +1,8 @@
-"""Datasets of expert episodes: collect, store, verify and load them."""
+"""Datasets of expert episodes: collect, store, verify and load them.
+
+Public names are imported on first use.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

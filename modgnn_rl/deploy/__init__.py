@@ -1,1 +1,8 @@
-"""Run a policy agent by agent: in Python, and as an exported ONNX model."""
+"""Run a policy agent by agent: in Python, and as an exported ONNX model.
+
+Public names are imported on first use.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

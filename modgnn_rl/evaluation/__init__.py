@@ -1,1 +1,8 @@
-"""Rollouts of policies, their metrics, and statistics over episodes."""
+"""Rollouts of policies, their metrics, and statistics over episodes.
+
+Public names are imported on first use.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

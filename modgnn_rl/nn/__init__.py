@@ -1,1 +1,8 @@
-"""ModGNN: graphs, communication, aggregation, layers, and the policy that they form."""
+"""ModGNN: graphs, communication, aggregation, layers, and the policy that they form.
+
+Public names are imported on first use.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

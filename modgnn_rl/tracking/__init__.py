@@ -1,1 +1,8 @@
-"""Run folders, checkpoints, loggers, and what lists and compares runs."""
+"""Run folders, checkpoints, loggers, and what lists and compares runs.
+
+Public names are imported on first use.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,13 @@
+from .rollout import EpisodeMetrics as EpisodeMetrics
+from .rollout import evaluate as evaluate
+from .rollout import make_eval_env as make_eval_env
+from .rollout import reference_policies as reference_policies
+from .statistics import Interval as Interval
+from .statistics import Summary as Summary
+from .statistics import interquartile_interval as interquartile_interval
+from .statistics import interquartile_mean as interquartile_mean
+from .statistics import paired_difference as paired_difference
+from .statistics import probability_of_improvement as probability_of_improvement
+from .statistics import summarise as summarise
+from .table import read_tables as read_tables
+from .table import summarise_rollouts as summarise_rollouts

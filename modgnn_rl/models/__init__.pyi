@@ -1,0 +1,11 @@
+from .blocks import BallHead as BallHead
+from .blocks import LayerSpec as LayerSpec
+from .blocks import Relative as Relative
+from .blocks import Scale as Scale
+from .blocks import Zero as Zero
+from .blocks import is_equivariant as is_equivariant
+from .blocks import mlp as mlp
+from .central import CentralLayer as CentralLayer
+from .equivariant import PairForce as PairForce
+from .factory import configured_model as configured_model
+from .factory import make_model as make_model

@@ -1,0 +1,17 @@
+from .communication import Adjacency as Adjacency
+from .communication import Communication as Communication
+from .communication import CoordinateFrame as CoordinateFrame
+from .communication import GraphAttention as GraphAttention
+from .communication import GraphShift as GraphShift
+from .communication import Laplacian as Laplacian
+from .communication import MessagePassing as MessagePassing
+from .communication import NormalizedAdjacency as NormalizedAdjacency
+from .graph import DenseGraph as DenseGraph
+from .graph import EdgeList as EdgeList
+from .graph import Graph as Graph
+from .layer import ModGNNLayer as ModGNNLayer
+from .modgnn import ModGNN as ModGNN
+from .primer import RecurrentStatePrimer as RecurrentStatePrimer
+from .topology import Topology as Topology
+from .topology import as_matrix as as_matrix
+from .topology import reachable as reachable

@@ -1,0 +1,14 @@
+from .checkpoint import Checkpoint as Checkpoint
+from .checkpoint import has_checkpoint as has_checkpoint
+from .checkpoint import load_checkpoint as load_checkpoint
+from .checkpoint import save_checkpoint as save_checkpoint
+from .comparison import compare as compare
+from .listing import list_runs as list_runs
+from .loading import load_env_config as load_env_config
+from .loading import load_policy as load_policy
+from .loggers import LoggerGroup as LoggerGroup
+from .loggers import make_logger as make_logger
+from .run_folder import RunFolder as RunFolder
+from .summary import RunSummary as RunSummary
+from .summary import find_runs as find_runs
+from .summary import summarise_run as summarise_run
