@@ -23,17 +23,18 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import tensordict
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.models.blocks import LATENT, mlp
-from modgnn_rl.nn import aggregation, graph
+from modgnn_rl.nn import aggregation, fused, graph
 
 HIDDEN, INPUTS, OUTPUTS = 32, 6, 3
 SHAPES = ((256, 32), (1, 1024))
@@ -163,7 +164,7 @@ def _within(context: contextlib.AbstractContextManager[object], run: Run) -> Non
 @contextlib.contextmanager
 def patched(**values: object) -> Iterator[None]:
     """Set attributes ``module__NAME`` of the library for a while."""
-    modules = {"aggregation": aggregation, "graph": graph}
+    modules = {"aggregation": aggregation, "fused": fused, "graph": graph}
     targets = [(modules[key.partition("__")[0]], key.partition("__")[2], value) for key, value in values.items()]
     before = [(module, name, getattr(module, name)) for module, name, _ in targets]
     for module, name, value in targets:
@@ -175,21 +176,47 @@ def patched(**values: object) -> Iterator[None]:
             setattr(module, name, value)
 
 
-class _NoRewrite:
+class _CheckpointedReluSum:
+    """What the hand-written backward pass of `fused` computes, by ``torch.utils.checkpoint``."""
+
     @staticmethod
-    def rewrite(*_: object) -> None:
-        """Rewrite nothing."""
+    def apply(edges: graph.EdgeList, incoming: Tensor, own: Tensor | None, *weights: Tensor | None) -> Tensor:
+        """Sums of the last ReLU's output over incoming edges [R, F]."""
+
+        def of_block(receivers: slice, part: slice, incoming: Tensor, own: Tensor | None) -> Tensor:
+            hidden = incoming.index_select(0, edges.sender[part])
+            if own is not None:
+                hidden = hidden - own.index_select(0, edges.receiver[part])
+            hidden = hidden.relu()
+            for weight, bias in zip(weights[::2], weights[1::2], strict=True):
+                hidden = nn.functional.linear(hidden, cast(Tensor, weight), bias).relu()
+            offsets = edges.offsets()[receivers] - part.start
+            return nn.functional.embedding_bag(torch.arange(len(hidden)), hidden, offsets, mode="sum")
+
+        blocks = [
+            checkpoint(of_block, *block, incoming, own, use_reentrant=False, preserve_rng_state=False)
+            for block in edges.blocks()
+        ]
+        return torch.cat(blocks)
 
 
+class _NotFused:
+    @staticmethod
+    def fuse(*_: object) -> None:
+        """Fuse nothing."""
+
+
+ALL_EDGES = 1 << 40
 WITHOUT: Mapping[str, Callable[[], contextlib.AbstractContextManager[object]]] = {
     "nothing": contextlib.nullcontext,
-    "blocks (all links at once)": lambda: patched(graph__BLOCK={"cpu": 1 << 40}),
-    "layers moved to nodes, hand-written backward": lambda: patched(aggregation__relu_links=_NoRewrite),
-    "the same, activations stored": lambda: patched(
-        aggregation__relu_links=_NoRewrite, aggregation__STORED_LINKS=1 << 40
+    "blocks (all edges at once)": lambda: patched(graph__BLOCK={"cpu": ALL_EDGES}),
+    "hand-written backward pass (checkpointed instead)": lambda: patched(fused___ReluSum=_CheckpointedReluSum),
+    "layers moved to nodes": lambda: patched(aggregation__fused=_NotFused),
+    "the same, all activations stored": lambda: patched(
+        aggregation__fused=_NotFused, aggregation__MAX_STORED_EDGES=ALL_EDGES
     ),
-    "the same, stored, all links at once": lambda: patched(
-        aggregation__relu_links=_NoRewrite, aggregation__STORED_LINKS=1 << 40, graph__BLOCK={"cpu": 1 << 40}
+    "the same, stored, all edges at once": lambda: patched(
+        aggregation__fused=_NotFused, aggregation__MAX_STORED_EDGES=ALL_EDGES, graph__BLOCK={"cpu": ALL_EDGES}
     ),
 }
 

@@ -71,7 +71,7 @@ def reynolds(
     state = [value.reshape(-1, agents, 3) for value in (position, velocity)]
     mask = None if mask is None else mask.expand(*batch, agents).reshape(-1, agents)
     if visible is not None and visible.dtype == torch.int64:
-        force = _forces_over_edges(state, Topology(visible, agents, mask=mask, form="links").all_edges(), gains)
+        force = _forces_over_edges(state, Topology(visible, agents, mask=mask, form="edges").all_edges(), gains)
     else:
         seen = None if visible is None else visible.expand(*batch, agents, agents).reshape(-1, agents, agents)
         force = _forces_of_pairs(state, seen, mask, gains)

@@ -14,16 +14,17 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.nn.aggregation import Hop, NodeFeatures, aggregate, call
+from modgnn_rl.nn.aggregation import NodeFeatures, NodeInputs, aggregate, call_submodule
 from modgnn_rl.nn.graph import DenseGraph
-from modgnn_rl.nn.layer import ModGNNLayer, only_finite
+from modgnn_rl.nn.layer import ModGNNLayer
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.nn.window import mask_invalid
 from modgnn_rl.utils.tensors import mask_rows
 
-__all__ = ["Agent", "LinkData", "check_local", "link_data", "no_messages", "own_data", "step"]
+__all__ = ["Agent", "EdgeData", "check_local", "edge_data", "no_messages", "own_data", "step"]
 
 
-class LinkData(NamedTuple):
+class EdgeData(NamedTuple):
     """What is known of each link beside the message that comes over it.
 
     Attributes:
@@ -61,10 +62,10 @@ class Agent:
         InputError: the policy needs more than one agent knows, see `check_local`.
     """
 
-    def __init__(self, policy: ModGNN, links: LinkData | None = None) -> None:
+    def __init__(self, policy: ModGNN, links: EdgeData | None = None) -> None:
         check_local(policy)
         self.policy = policy
-        self.links = link_data(policy) if links is None else links
+        self.links = edge_data(policy) if links is None else links
         self._features: int | None = None
         self.reset()
 
@@ -128,7 +129,7 @@ class Agent:
             rows = [] if given is None and has_it and len(inbox) == 0 else given
             if (rows is not None) != has_it:
                 need = "needs" if has_it else "was built without"
-                raise InputError(f"this agent {need} the {name} of links; its LinkData is {tuple(self.links)}")
+                raise InputError(f"this agent {need} the {name} of links; its EdgeData is {tuple(self.links)}")
             if rows is not None:
                 heard[name] = _rows(f"the {name} of links", rows, width, self._messages, len(inbox))
         self._heard = heard
@@ -208,11 +209,11 @@ def _layer_step(
     Returns:
         output [1, O], and messages [K, D'] of this step.
     """
-    seen, tables, sees = only_finite(observation, own)
+    seen, tables, sees = mask_invalid(observation, own)
     tables[("input",)] = seen
     # Modules may work in place; what they are given here is read again.
-    data, held = call(layer.f_input, seen.clone(), tables), sees
-    total = call(layer.f_mid[0], call(layer.f_pre[0], data.clone(), tables), tables)
+    data, held = call_submodule(layer.f_input, seen.clone(), tables), sees
+    total = call_submodule(layer.f_mid[0], call_submodule(layer.f_pre[0], data.clone(), tables), tables)
     sent = []
     for hop in range(1, layer.hops + 1):
         sent.append(mask_rows(data, held, torch.nan).to(seen.dtype)[0])
@@ -220,13 +221,13 @@ def _layer_step(
         if layer.start == "zero":
             they_hold = torch.ones_like(they_hold)
         held = they_hold[:1]
-        graph, incoming = links.between(they_hold, held), Hop(senders, senders[:1], tables)
+        graph, incoming = links.subgraph(they_hold, held), NodeInputs(senders, senders[:1], tables)
         f_com = layer.f_com[hop - 1]
         if hop < layer.hops:  # before f_pre works on the messages, maybe in place
             data = aggregate(graph, f_com, nn.Identity(), incoming, layer.aggregation)
         summed = aggregate(graph, f_com, layer.f_pre[hop], incoming, layer.aggregation)
-        total = total + mask_rows(call(layer.f_mid[hop], summed, tables), held)
-    output = mask_rows(call(layer.f_final, total, tables), sees, torch.nan)
+        total = total + mask_rows(call_submodule(layer.f_mid[hop], summed, tables), held)
+    output = mask_rows(call_submodule(layer.f_final, total, tables), sees, torch.nan)
     return output, torch.stack(_of_one_width(sent)) if sent else data.new_zeros(0, data.shape[-1])
 
 
@@ -249,15 +250,15 @@ def check_local(policy: ModGNN) -> None:
             )
 
 
-def link_data(policy: ModGNN) -> LinkData:
+def edge_data(policy: ModGNN) -> EdgeData:
     """What a policy reads of links, as far as its keys say.
 
     Raises:
         InputError: it reads features; their number is not known.
     """
-    if policy._link_keys["feature"] is not None:
-        raise InputError("this policy reads features of links: say how many, as in links=LinkData(feature=2)")
-    return LinkData(weight=policy._link_keys["weight"] is not None)
+    if policy._edge_keys["feature"] is not None:
+        raise InputError("this policy reads features of links: say how many, as in links=EdgeData(feature=2)")
+    return EdgeData(weight=policy._edge_keys["weight"] is not None)
 
 
 def own_data(policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tensor]) -> dict[tuple[str, ...], Tensor]:
@@ -276,7 +277,7 @@ def own_data(policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tens
     return found
 
 
-def no_messages(policy: ModGNN, observation: Tensor, own: NodeFeatures, links: LinkData) -> Tensor:
+def no_messages(policy: ModGNN, observation: Tensor, own: NodeFeatures, links: EdgeData) -> Tensor:
     """The messages of an agent that holds nothing, NaN [K, D]; their width is found by a step without neighbours.
 
     Raises:

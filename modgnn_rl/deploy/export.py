@@ -21,7 +21,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from modgnn_rl.deploy.agent import LinkData, check_local, link_data, no_messages, own_data, step
+from modgnn_rl.deploy.agent import EdgeData, check_local, edge_data, no_messages, own_data, step
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.utils.files import fsync_file, fsync_folder
@@ -57,7 +57,7 @@ def export_agent(
     observation: Tensor,
     *,
     own: Mapping[NestedKey, Tensor] | None = None,
-    links: LinkData | None = None,
+    links: EdgeData | None = None,
     model: str | None = None,
     control_frequency: float | None = None,
 ) -> Exported:
@@ -87,7 +87,7 @@ def export_agent(
         raise InputError(f"an agent is exported for float32 or float64, not for observations of {observation.dtype}")
     policy = copy.deepcopy(policy).cpu().eval()
     with torch.no_grad():
-        inputs = _example_inputs(policy, observation, own or {}, link_data(policy) if links is None else links)
+        inputs = _example_inputs(policy, observation, own or {}, edge_data(policy) if links is None else links)
         module = _Step(policy, list(inputs))
         program, onnx_model = _trace(module, inputs)
         difference = _largest_difference(module, program, onnx_model, inputs)
@@ -141,7 +141,7 @@ class _Step(nn.Module):
 
 
 def _example_inputs(
-    policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tensor], links: LinkData, neighbours: int = 3
+    policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tensor], links: EdgeData, neighbours: int = 3
 ) -> Inputs:
     """Inputs of a step by name, in the order in which the files take them."""
     observation = observation.cpu()

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.aggregation import NodeFeatures
-from modgnn_rl.nn.layer import Recorder, only_finite
 from modgnn_rl.nn.topology import Topology
+from modgnn_rl.nn.window import Recorder, mask_invalid
 from modgnn_rl.utils.tensors import mask_rows
 
 __all__ = ["CentralLayer"]
@@ -32,7 +32,7 @@ class CentralLayer(nn.Module):
     hops = 0
     own_keys: frozenset[tuple[str, ...]] = frozenset()
     sends_plain_data = True
-    results = (("f_final",),)
+    intermediate_names = (("f_final",),)
 
     def __init__(
         self, num_agents: int, features: int, hidden: int, outputs: int, *, scale: nn.Module, head: nn.Module
@@ -73,7 +73,7 @@ class CentralLayer(nn.Module):
                 "once and serves one number only: train another, or take a model that shares its weights over agents"
             )
         topology = adjacency if isinstance(adjacency, Topology) else Topology(adjacency, shape[-1], receivers=receivers)
-        seen, _, sees = only_finite(observation.reshape(shape.numel(), -1), {})
+        seen, _, sees = mask_invalid(observation.reshape(shape.numel(), -1), {})
         there = sees if topology.exists is None else sees & topology.exists
         flocks = mask_rows(seen, there).unflatten(0, (-1, self.num_agents))
         counts = there.view(-1, self.num_agents, 1).sum(1, keepdim=True).clamp(min=1)
@@ -82,8 +82,8 @@ class CentralLayer(nn.Module):
         inputs = mask_rows(self.scale(centred), there).view(-1, self.num_agents * centred.shape[-1])
         output = self.head(self.network(inputs).view(shape.numel(), self.outputs))
         output = mask_rows(output, sees, torch.nan)
-        if topology.wanted_nodes is not None:
-            output = mask_rows(output, topology.wanted_nodes)
+        if topology.targets is not None:
+            output = mask_rows(output, topology.targets)
         if record is not None and record.wants("f_final"):
-            record.nodes("f_final", None, output)
+            record.record_nodes("f_final", None, output)
         return output.unflatten(0, shape), seen.new_zeros(*shape, 0, seen.shape[-1])

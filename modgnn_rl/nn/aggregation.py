@@ -1,47 +1,49 @@
-"""From the neighbours' messages to one vector an agent: ``sum_j f_pre(f_com(m_j, m_i))``, where nearly all time goes.
+"""From the neighbours' messages to one vector per agent: ``sum_j f_pre(f_com(m_j, m_i))``, which takes nearly all time.
 
-`aggregate` is the one function that the layers call; a fused kernel would replace it. It chooses between
+`aggregate` is the one function that the layers call. It chooses between
 
-- the *exact rewrites* of `modgnn_rl.nn.fused`, for a plain f_com and an f_pre of linear layers and ReLUs: linear
-  layers before the first ReLU act on nodes instead of links, those after the last ReLU on the sum;
-- *blocks of links* that stay in the processor's cache, and are computed again in the backward pass instead of being
-  stored where there are many; any f_com and f_pre;
-- *all at once*, where blocks would not be exact (batch statistics, values of links asked for) or possible
-(`DenseGraph`).
+- `modgnn_rl.nn.fused`, for a plain f_com and an f_pre of linear layers and ReLUs: linear layers before the first ReLU
+  are applied to nodes instead of edges, those after the last ReLU to the sum;
+- blocks of edges whose activations stay in the processor's cache, for any f_com and f_pre. Beyond `MAX_STORED_EDGES`
+  the backward pass recomputes the activations (gradient checkpointing);
+- all edges at once, where blocks would change the result (batch statistics), edge values are asked for, or the graph is
+  a `DenseGraph`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.func import functional_call
-from torch.nn.modules.batchnorm import _NormBase
+from torch.utils.checkpoint import checkpoint
 
 from modgnn_rl.nn import fused
 from modgnn_rl.nn.communication import Communication
 from modgnn_rl.nn.graph import EdgeList, Graph
 from modgnn_rl.utils.tensors import is_transformed
 
-__all__ = ["Hop", "aggregate", "call", "suited_form"]
+__all__ = ["NodeInputs", "aggregate", "call_submodule", "resolve_form"]
 
-STORED_LINKS = 1 << 16  # up to this many links, the backward pass finds all activations stored
+MAX_STORED_EDGES = 1 << 16  # the activations of this many edges are stored for the backward pass, others recomputed
 
 NodeFeatures = Mapping[tuple[str, ...], Tensor]
+EdgeFunction = Callable[[Graph, Tensor, Tensor, NodeFeatures], Tensor]
 
 
-class Hop(NamedTuple):
-    """What the agents hold when messages of one hop come in.
+class NodeInputs(NamedTuple):
+    """What the two ends of edges hold when the messages of one hop arrive.
 
     Attributes:
         senders: what each sender held one step earlier [S, D].
         receivers: what each receiver held one step earlier [R, D].
-        own: data of the receivers now, by the key that a keyed submodule reads them under [R, ...].
+        own: the receivers' data now, by the key under which a keyed submodule reads them [R, ...].
     """
 
     senders: Tensor
@@ -49,231 +51,157 @@ class Hop(NamedTuple):
     own: NodeFeatures
 
 
-def call(module: nn.Module, data: Tensor, own: NodeFeatures, links: Graph | None = None) -> Tensor:
-    """Apply a plain or a keyed submodule to rows of data [E, D]; ``own`` [E, ...] and ``links`` are for keyed ones."""
+def call_submodule(module: nn.Module, data: Tensor, own: NodeFeatures, graph: Graph | None = None) -> Tensor:
+    """Apply a plain or a keyed submodule to rows of data.
+
+    Args:
+        module: a plain module, or a TensorDictModule with keys of its own.
+        data: [E, D].
+        own: further rows for a keyed module [E, ...].
+        graph: where the rows are edges, the graph whose weights and features a keyed module may read.
+
+    Returns:
+        [E, F].
+    """
     if not isinstance(module, TensorDictModuleBase):
         return module(data)
-    return _call_keyed(module, {("data",): data, **own}, links)
+    return _call_keyed(module, {("data",): data, **own}, graph)
 
 
-def _call_keyed(module: TensorDictModuleBase, entries: NodeFeatures, links: Graph | None) -> Tensor:
+def _call_keyed(module: TensorDictModuleBase, entries: NodeFeatures, graph: Graph | None) -> Tensor:
     rows = TensorDict({}, next(iter(entries.values())).shape[:1])
     for key, value in entries.items():
         rows[key] = value
-    if links is not None and links.weight is not None:
-        rows["link", "weight"] = links.weight.unsqueeze(-1)
-    if links is not None and links.feature is not None:
-        rows["link", "feature"] = links.feature
+    if graph is not None and graph.weight is not None:
+        rows["edge", "weight"] = graph.weight.unsqueeze(-1)
+    if graph is not None and graph.feature is not None:
+        rows["edge", "feature"] = graph.feature
     return module(rows)[module.out_keys[-1]]
 
 
-def communicate(f_com: nn.Module, sender: Tensor, receiver: Tensor, own: NodeFeatures, links: Graph) -> Tensor:
-    """Y of the links [E, D'], with whichever signature f_com has."""
+def _communicate(f_com: nn.Module, graph: Graph, sender: Tensor, receiver: Tensor, own: NodeFeatures) -> Tensor:
+    """Apply f_com, with whichever signature it has, to the two ends of all edges [E, D]."""
     if isinstance(f_com, Communication):
-        return f_com(sender, receiver, links)
+        return f_com(sender, receiver, graph)
     if isinstance(f_com, TensorDictModuleBase):
-        return _call_keyed(f_com, {("sender",): sender, ("receiver",): receiver, **own}, links)
+        return _call_keyed(f_com, {("sender",): sender, ("receiver",): receiver, **own}, graph)
     return f_com(sender, receiver)
+
+
+def _compute_edges(
+    f_com: nn.Module,
+    f_pre: nn.Module,
+    record: Callable[[str, Tensor], None] | None,
+    graph: Graph,
+    sender: Tensor,
+    receiver: Tensor,
+    own: NodeFeatures,
+) -> Tensor:
+    """``f_pre(f_com(m_j, m_i))`` of edges [E, F], from the data of their ends [E, D]."""
+    y = _communicate(f_com, graph, sender, receiver, own)
+    if record is not None:
+        record("f_com", y)
+    result = call_submodule(f_pre, y, own, graph)
+    if record is not None:
+        record("f_pre", result)
+    return result
+
+
+class _EdgeModule(nn.Module):
+    """`_compute_edges` with its two modules, as one module."""
+
+    def __init__(self, f_com: nn.Module, f_pre: nn.Module) -> None:
+        super().__init__()
+        self.f_com, self.f_pre = f_com, f_pre
+
+    def forward(self, graph: Graph, sender: Tensor, receiver: Tensor, own: NodeFeatures) -> Tensor:
+        return _compute_edges(self.f_com, self.f_pre, None, graph, sender, receiver, own)
+
+    def state(self) -> dict[str, Tensor]:
+        """The parameters, and copies of the buffers, which modules may change as they run.
+
+        A module in several places is listed once; parameters that several modules share are listed with each.
+        """
+        state: dict[str, Tensor] = {}
+        for path, module in self.named_modules():
+            state |= {f"{path}.{name}": value for name, value in module.named_parameters(recurse=False)}
+            state |= {f"{path}.{name}": value.clone() for name, value in module.named_buffers(recurse=False)}
+        return state
 
 
 def aggregate(
     graph: Graph,
     f_com: nn.Module,
     f_pre: nn.Module,
-    hop: Hop,
+    inputs: NodeInputs,
     aggregation: str = "sum",
     record: Callable[[str, Tensor], None] | None = None,
 ) -> Tensor:
-    """Aggregate ``f_pre(f_com(m_j, m_i))`` over the links that each agent receives on.
+    """Aggregate ``f_pre(f_com(m_j, m_i))`` over the incoming edges of each receiver.
 
     Args:
-        graph: the links.
+        graph: the edges.
         f_com: see `modgnn_rl.nn.communication`.
         f_pre: a plain module, or one with keys of its own.
-        hop: what the agents hold.
+        inputs: what the nodes hold.
         aggregation: ``sum``, ``mean`` or ``max``.
-        record: is given ``("f_com", y)`` and ``("f_pre", f_pre(y))`` of all links.
+        record: called with ``("f_com", y)`` and ``("f_pre", f_pre(y))`` of all edges.
 
     Returns:
-        one row a receiver [R, F]; zero where it receives on no link.
+        one row per receiver [R, F]; zero for a receiver without edges.
     """
     if record is not None or not isinstance(graph, EdgeList) or _has_batch_statistics(f_com, f_pre):
-        own = {key: graph.gather_receivers(value) for key, value in hop.own.items()}
-        rows = graph.gather_senders(hop.senders), graph.gather_receivers(hop.receivers)
-        return graph.aggregate(_values(f_com, f_pre, graph, *rows, own, record), aggregation)
-    rewritten = fused.rewrite(graph, f_com, f_pre) if aggregation in ("sum", "mean") else None
-    if rewritten is not None:
-        total = rewritten(hop.senders, hop.receivers)
+        return _aggregate_block(graph, functools.partial(_compute_edges, f_com, f_pre, record), inputs, aggregation)
+    fused_sum = fused.fuse(graph, f_com, f_pre) if aggregation in ("sum", "mean") else None
+    if fused_sum is not None:
+        total = fused_sum(inputs.senders, inputs.receivers)
         return total / graph.degree().clamp(min=1).unsqueeze(-1) if aggregation == "mean" else total
-    tables = (hop.senders, hop.receivers, *hop.own.values())
-    values = _OfLinks(f_com, f_pre)
-    if torch.is_grad_enabled() and len(graph) > STORED_LINKS and not _learned_links(graph):
-        return _Recomputed.apply(values, graph, aggregation, tuple(hop.own), *tables, *values.weights().values())
-    return _in_blocks(values, graph, aggregation, tuple(hop.own), tables)
-
-
-def _values(
-    f_com: nn.Module,
-    f_pre: nn.Module,
-    links: Graph,
-    sender: Tensor,
-    receiver: Tensor,
-    own: NodeFeatures,
-    record: Callable[[str, Tensor], None] | None = None,
-) -> Tensor:
-    """``f_pre(f_com(m_j, m_i))`` of links [E, F]."""
-    y = communicate(f_com, sender, receiver, own, links)
-    if record is not None:
-        record("f_com", y)
-    result = call(f_pre, y, own, links)
-    if record is not None:
-        record("f_pre", result)
-    return result
-
-
-class _OfLinks(nn.Module):
-    """`_values` with its two modules, as one module."""
-
-    def __init__(self, f_com: nn.Module, f_pre: nn.Module) -> None:
-        super().__init__()
-        self.f_com, self.f_pre = f_com, f_pre
-
-    def forward(self, links: Graph, sender: Tensor, receiver: Tensor, own: NodeFeatures) -> Tensor:
-        return _values(self.f_com, self.f_pre, links, sender, receiver, own)
-
-    def weights(self) -> dict[str, Tensor]:
-        """Parameters and buffers by the place where they are; buffers as they are now: modules change them as they run.
-
-        A module in several places comes once. Parameters that several modules share come with each.
-        """
-        found: dict[str, Tensor] = {}
-        for path, module in self.named_modules():
-            found |= {f"{path}.{name}": value for name, value in module.named_parameters(recurse=False)}
-            found |= {f"{path}.{name}": value.clone() for name, value in module.named_buffers(recurse=False)}
-        return found
-
-
-def _in_blocks(
-    values: _OfLinks, graph: EdgeList, aggregation: str, keys: tuple[tuple[str, ...], ...], tables: Iterable[Tensor]
-) -> Tensor:
-    """Aggregate block by block; whole neighbourhoods lie in one block."""
-    senders, *of_receivers = tables
-    results = []
-    for receivers, links in graph.blocks():
-        block = graph.block(receivers, links)
-        receiver, *own = (block.gather_receivers(table[receivers]) for table in of_receivers)
-        result = values(block, block.gather_senders(senders), receiver, dict(zip(keys, own, strict=True)))
-        results.append(block.aggregate(result, aggregation))
+    results = list(_aggregate_blocks(graph, _EdgeModule(f_com, f_pre), inputs, aggregation))
     return results[0] if len(results) == 1 else torch.cat(results)
 
 
-class _Recomputed(torch.autograd.Function):
-    """`_in_blocks` that stores the nodes' tables only, and computes each block again in the backward pass.
+def _aggregate_blocks(graph: EdgeList, compute: _EdgeModule, inputs: NodeInputs, aggregation: str) -> Iterator[Tensor]:
+    """Yield the aggregates of one block of receivers after another."""
+    for receivers, edges in graph.blocks():
+        block = graph.block(receivers, edges)
+        own = {key: value[receivers] for key, value in inputs.own.items()}
+        block_inputs = NodeInputs(inputs.senders, inputs.receivers[receivers], own)
+        is_stored = edges.stop <= MAX_STORED_EDGES or not torch.is_grad_enabled()
+        yield (_aggregate_block if is_stored else _checkpointed_block)(block, compute, block_inputs, aggregation)
 
-    The weights are those of the forward pass, which may have been lent to the modules for it (``functional_call``, the
-    losses of TorchRL) and taken back since.
+
+def _aggregate_block(graph: Graph, compute: EdgeFunction, inputs: NodeInputs, aggregation: str) -> Tensor:
+    """Gather the data at the ends of edges, compute the edges, aggregate."""
+    own = {key: graph.gather_receivers(value) for key, value in inputs.own.items()}
+    sender, receiver = graph.gather_senders(inputs.senders), graph.gather_receivers(inputs.receivers)
+    return graph.aggregate(compute(graph, sender, receiver, own), aggregation)
+
+
+def _checkpointed_block(graph: EdgeList, compute: _EdgeModule, inputs: NodeInputs, aggregation: str) -> Tensor:
+    """`_aggregate_block` that stores no activations: the backward pass computes the block again.
+
+    It then uses the weights and buffers as they are now: weights may be lent to the modules for the forward pass only
+    (``functional_call``, the losses of TorchRL), and modules may change their buffers.
     """
+    state, keys = compute.state(), tuple(inputs.own)
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        values: _OfLinks,
-        graph: EdgeList,
-        aggregation: str,
-        keys: tuple[tuple[str, ...], ...],
-        *tensors: Tensor,
-    ) -> Tensor:
-        ctx.values, ctx.graph, ctx.aggregation, ctx.keys = values, graph, aggregation, keys
-        ctx.names = tuple(values.weights())
-        device = tensors[0].device
-        ctx.autocast = (device.type, torch.get_autocast_dtype(device.type), torch.is_autocast_enabled(device.type))
-        ctx.generators = _generator_states(device)
-        ctx.save_for_backward(*tensors)
-        return _in_blocks(values, graph, aggregation, keys, tensors[: 2 + len(keys)])
+    def recompute(*arguments: object) -> Tensor:
+        return functional_call(compute, state, arguments, tie_weights=False)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> Any:
-        count = 2 + len(ctx.keys)
-        tensors, wanted = ctx.saved_tensors, ctx.needs_input_grad[4:]
-        senders, *of_receivers = tensors[:count]
-        weights = [
-            tensor.detach().clone().requires_grad_(needed)
-            for tensor, needed in zip(tensors[count:], wanted[count:], strict=True)
-        ]
-        gradients = [
-            torch.zeros_like(tensor) if needed else None for tensor, needed in zip(tensors, wanted, strict=True)
-        ]
-        kind, dtype, enabled = ctx.autocast
-        with _GeneratorsAt(ctx.generators, senders.device), torch.autocast(kind, dtype, enabled):
-            for receivers, links in ctx.graph.blocks():
-                block = ctx.graph.block(receivers, links)
-                rows = [
-                    block.gather_senders(senders),
-                    *(block.gather_receivers(table[receivers]) for table in of_receivers),
-                ]
-                rows = [row.requires_grad_(needed) for row, needed in zip(rows, wanted, strict=False)]
-                leaves = [tensor for tensor, needed in zip((*rows, *weights), wanted, strict=True) if needed]
-                with torch.enable_grad():
-                    sender, receiver, *own = (row.clone() for row in rows)  # which modules may change in place
-                    inputs = block, sender, receiver, dict(zip(ctx.keys, own, strict=True))
-                    given = dict(zip(ctx.names, weights, strict=True))
-                    result = functional_call(ctx.values, given, inputs, tie_weights=False)
-                    result = block.aggregate(result, ctx.aggregation)
-                if not result.requires_grad:
-                    continue
-                found = iter(
-                    torch.autograd.grad(result, leaves, gradient[receivers].to(result.dtype), allow_unused=True)
-                )
-                for index, total in enumerate(gradients):
-                    part = None if total is None else next(found)
-                    if total is None or part is None:
-                        continue
-                    if index == 0:
-                        total.index_add_(0, block.sender, part)
-                    elif index < count:
-                        total[receivers] += block.scatter_sum(part)
-                    else:
-                        total += part
-        return None, None, None, None, *gradients
+    functions: Iterator[EdgeFunction] = itertools.chain([compute], itertools.repeat(recompute))
 
+    def run(senders: Tensor, receivers: Tensor, *own: Tensor) -> Tensor:
+        block_inputs = NodeInputs(senders, receivers, dict(zip(keys, own, strict=True)))
+        return _aggregate_block(graph, next(functions), block_inputs, aggregation)
 
-class _GeneratorsAt:
-    """Draw from torch's global generators as they once stood, then put them back: random modules draw alike."""
-
-    def __init__(self, states: list[Tensor], device: torch.device) -> None:
-        self.states, self.device = states, device
-
-    def __enter__(self) -> None:
-        self.before = _generator_states(self.device)
-        _set_generators(self.states, self.device)
-
-    def __exit__(self, *_: object) -> None:
-        _set_generators(self.before, self.device)
-
-
-def _generator_states(device: torch.device) -> list[Tensor]:
-    states = [torch.get_rng_state()]
-    if device.type != "cpu":
-        states.append(torch.get_device_module(device).get_rng_state(device))
-    return states
-
-
-def _set_generators(states: list[Tensor], device: torch.device) -> None:
-    torch.set_rng_state(states[0])
-    if len(states) > 1:
-        torch.get_device_module(device).set_rng_state(states[1], device)
-
-
-def _learned_links(graph: EdgeList) -> bool:
-    return any(value is not None and value.requires_grad for value in (graph.weight, graph.feature))
+    return checkpoint(run, inputs.senders, inputs.receivers, *inputs.own.values(), use_reentrant=False)
 
 
 def _has_batch_statistics(*modules: nn.Module) -> bool:
     """Whether modules, or parts of them, normalise by statistics of the rows that they are given."""
-    return any(isinstance(part, _NormBase) for module in modules for part in module.modules())
+    return any(hasattr(part, "track_running_stats") for module in modules for part in module.modules())
 
 
-def suited_form(form: str, module: nn.Module) -> str:
-    """The form of graph to work on: where it is not set, links if batch statistics must see nothing else."""
-    return "links" if form == "auto" and _has_batch_statistics(module) and not is_transformed() else form
+def resolve_form(form: str, module: nn.Module) -> str:
+    """The form of graphs for a module: ``auto`` becomes ``edges`` if batch statistics must see existing edges only."""
+    return "edges" if form == "auto" and _has_batch_statistics(module) and not is_transformed() else form

@@ -1,12 +1,12 @@
-"""Communication between neighbours: the choices of f_com.
+"""Communication between neighbours: implementations of f_com.
 
 An f_com computes what an agent makes of one incoming message, ``y_ij = f_com(m_j, m_i)``, from the aggregates that
 sender and receiver held one step earlier. It may be
 
-- any module ``f_com(sender, receiver) -> y`` of two tensors [E, D], one row a link;
-- a `Communication`, which also sees the links: their weights and features, and the whole neighbourhood;
-- a TensorDictModule that reads ``"sender"``, ``"receiver"``, the receiver's own data now under ``"own"``, and the
-  links' ``("link", "weight")`` [E, 1] and ``("link", "feature")`` [E, F]; its last out-key is y.
+- any module ``f_com(sender, receiver) -> y`` of two tensors [E, D], one row per edge;
+- a `Communication`, which also sees the graph: edge weights and features, and the whole neighbourhood;
+- a TensorDictModule that reads ``"sender"``, ``"receiver"``, the receiver's own current data under ``"own"``, and the
+  edges' ``("edge", "weight")`` [E, 1] and ``("edge", "feature")`` [E, F]; its last out-key is y.
 """
 
 from __future__ import annotations
@@ -33,55 +33,55 @@ __all__ = [
 
 
 class Communication(nn.Module, abc.ABC):
-    """An f_com that sees the links beside the two ends.
+    """An f_com that sees the graph beside the two ends of each edge.
 
-    ``links`` gives ``links.weight`` [E] and ``links.feature`` [E, F] (None where there are none), and what needs a
-    whole neighbourhood: ``links.softmax(logits)`` over the links that a receiver receives on, ``links.degree()`` their
-    number [R], ``links.scatter_sum(values)`` their sum [R, F], and ``links.gather_receivers(table)``, which brings a
-    value of each receiver [R, F] to its links [E, F].
+    ``graph`` provides ``graph.weight`` [E] and ``graph.feature`` [E, F] (None if there are none), and functions of
+    whole neighbourhoods: ``graph.softmax(logits)`` over each receiver's incoming edges, ``graph.degree()``, their
+    number [R], ``graph.scatter_sum(values)``, their sum [R, F], and ``graph.gather_receivers(table)``, which gives each
+    edge its receiver's row of a table: [R, F] -> [E, F]. See `modgnn_rl.nn.graph.Graph`.
     """
 
     @abc.abstractmethod
-    def forward(self, sender: Tensor, receiver: Tensor, links: Graph) -> Tensor:
-        """Return y of the links [E, D'] from what their senders and receivers hold [E, D]."""
+    def forward(self, sender: Tensor, receiver: Tensor, graph: Graph) -> Tensor:
+        """Return y of the edges [E, D'] from what their senders and receivers hold [E, D]."""
 
 
 class GraphShift(Communication):
-    """An f_com without parameters that is linear: one application of a graph shift operator S, ``m <- S m``.
+    """A linear f_com without parameters: one application of a graph shift operator S, ``m <- S m``.
 
-    Weights of the links, where there are any, are the entries of S.
+    Edge weights, if there are any, are the entries of S.
     """
 
 
 class Adjacency(GraphShift):
-    """Incoming alone, ``w_ij m_j``: the graph shift operator A."""
+    """The incoming message alone, ``w_ij m_j``: the graph shift operator A."""
 
-    def forward(self, sender: Tensor, receiver: Tensor, links: Graph | None = None) -> Tensor:
+    def forward(self, sender: Tensor, receiver: Tensor, graph: Graph | None = None) -> Tensor:
         """Return ``w sender`` [E, D]."""
-        return _weigh(sender, links)
+        return _weigh(sender, graph)
 
 
 class Laplacian(GraphShift):
-    """Incoming minus own, ``w_ij (m_j - m_i)``: the operator A - D. Translations of all agents drop out."""
+    """Incoming minus own, ``w_ij (m_j - m_i)``: the operator A - D. It is invariant to translations of all agents."""
 
-    def forward(self, sender: Tensor, receiver: Tensor, links: Graph | None = None) -> Tensor:
+    def forward(self, sender: Tensor, receiver: Tensor, graph: Graph | None = None) -> Tensor:
         """Return ``w (sender - receiver)`` [E, D]."""
-        return _weigh(sender - receiver, links)
+        return _weigh(sender - receiver, graph)
 
 
 class NormalizedAdjacency(GraphShift):
-    """Incoming as a mean over the neighbours, ``w_ij m_j / sum_j w_ij``: the random-walk operator D^-1 A.
+    """The mean over neighbours, ``w_ij m_j / sum_j w_ij``: the random-walk operator D^-1 A.
 
-    The symmetric normalisation ``D^-1/2 A D^-1/2`` is not offered: it needs the number of the sender's neighbours now,
-    which no message of one step ago can tell.
+    The symmetric normalisation ``D^-1/2 A D^-1/2`` is not available: it needs the sender's current number of
+    neighbours, which a message that is one step old cannot contain.
     """
 
-    def forward(self, sender: Tensor, receiver: Tensor, links: Graph) -> Tensor:
+    def forward(self, sender: Tensor, receiver: Tensor, graph: Graph) -> Tensor:
         """Return ``w sender / sum of w`` [E, D]."""
-        if links.weight is None:
-            return sender / links.gather_receivers(links.degree()).unsqueeze(-1).clamp(min=1)
-        whole = links.gather_receivers(links.scatter_sum(links.weight.unsqueeze(-1)))
-        return links.weight.unsqueeze(-1) * sender / torch.where(whole == 0, 1.0, whole)
+        if graph.weight is None:
+            return sender / graph.gather_receivers(graph.degree()).unsqueeze(-1).clamp(min=1)
+        whole = graph.gather_receivers(graph.scatter_sum(graph.weight.unsqueeze(-1)))
+        return graph.weight.unsqueeze(-1) * sender / torch.where(whole == 0, 1.0, whole)
 
 
 class GraphAttention(Communication):
@@ -91,8 +91,8 @@ class GraphAttention(Communication):
 
         e_ij = a . LeakyReLU(W_s z + W_r m_i),   alpha_ij = softmax over j in N_i of e_ij,   y_ij = alpha_ij W_s z
 
-    so that the sum over the neighbours is the attention's output. If ``relative``, the receiver's own ``m_i`` is left
-    out, and y does not feel a translation of all agents.
+    so that the sum over the neighbours is the output of the attention. If ``relative``, the receiver's own ``m_i`` is
+    left out, and y is invariant to translations of all agents.
 
     Args:
         in_features: width of the messages D.
@@ -101,31 +101,31 @@ class GraphAttention(Communication):
         relative: attend to differences.
 
     Raises:
-        InputError: ``out_features`` is no multiple of ``heads``.
+        InputError: ``out_features`` is not a multiple of ``heads``.
     """
 
     def __init__(self, in_features: int, out_features: int, heads: int = 1, *, relative: bool = False) -> None:
         super().__init__()
         if out_features % heads:
-            raise InputError(f"out_features={out_features} is no multiple of heads={heads}; each head has its share")
+            raise InputError(f"out_features={out_features} is not a multiple of heads={heads}")
         self.heads, self.relative = heads, relative
         self.of_sender = nn.Linear(in_features, out_features, bias=False)
         self.of_receiver = None if relative else nn.Linear(in_features, out_features)
         self.score = nn.Parameter(torch.empty(heads, out_features // heads))
         nn.init.xavier_uniform_(self.score)
 
-    def forward(self, sender: Tensor, receiver: Tensor, links: Graph) -> Tensor:
-        """Return the attended data of the links [E, out_features]."""
+    def forward(self, sender: Tensor, receiver: Tensor, graph: Graph) -> Tensor:
+        """Return attention times value of the edges [E, out_features]."""
         value = self.of_sender(sender - receiver if self.relative else sender)
         key = value if self.of_receiver is None else value + self.of_receiver(receiver)
         scores = (nn.functional.leaky_relu(key.unflatten(-1, (self.heads, -1)), 0.2) * self.score).sum(-1)
-        return (links.softmax(scores).unsqueeze(-1) * value.unflatten(-1, (self.heads, -1))).flatten(-2)
+        return (graph.softmax(scores).unsqueeze(-1) * value.unflatten(-1, (self.heads, -1))).flatten(-2)
 
 
 class MessagePassing(Communication):
     """A learned network of sender and receiver (Gilmer et al. 2017), ``y_ij = network([m_j, m_i, w_ij, f_ij])``.
 
-    Weights and features of the links are appended where there are any.
+    Edge weights and features are appended if there are any.
 
     Args:
         network: maps [E, 2 D (+ 1) (+ F)] to [E, D'].
@@ -135,29 +135,32 @@ class MessagePassing(Communication):
         super().__init__()
         self.network = network
 
-    def forward(self, sender: Tensor, receiver: Tensor, links: Graph) -> Tensor:
-        """Return the network's output for each link [E, D']."""
+    def forward(self, sender: Tensor, receiver: Tensor, graph: Graph) -> Tensor:
+        """Return the network's output for each edge [E, D']."""
         parts = [sender, receiver]
-        if links.weight is not None:
-            parts.append(links.weight.unsqueeze(-1))
-        if links.feature is not None:
-            parts.append(links.feature)
+        if graph.weight is not None:
+            parts.append(graph.weight.unsqueeze(-1))
+        if graph.feature is not None:
+            parts.append(graph.feature)
         return self.network(torch.cat(parts, -1))
 
 
 class CoordinateFrame(Communication):
-    """The sender's data in the receiver's frame of coordinates: moved to its place, turned by its heading.
+    """The sender's data in the receiver's coordinate frame.
 
-    Points become relative to the receiver's position; points and vectors are then turned about the last axis (z, or the
-    plane's) by minus the heading of the receiver. All other columns stay as they are.
+    Points become relative to the receiver's position. Points and vectors are then rotated about the last axis (z, or
+    the normal of the plane) by minus the receiver's heading. All other columns stay as they are.
 
     Args:
         positions: first columns of the points in the message, each with ``dimensions`` columns: the agent's position,
-            and others (a goal, a landmark), if any.
-        vectors: first columns of the vectors (velocities, directions), likewise.
-        heading: column that holds the heading, rad; default: frames are not turned. The sender's heading becomes the
+            then others (a goal, a landmark), if any.
+        vectors: first columns of the vectors (velocities, directions).
+        heading: column of the heading, rad; default: frames are not rotated. The sender's heading becomes the
             difference of the headings, between -pi and pi.
         dimensions: 2 or 3.
+
+    Raises:
+        InputError: ``dimensions`` is neither 2 nor 3.
     """
 
     def __init__(
@@ -174,7 +177,7 @@ class CoordinateFrame(Communication):
         self.positions, self.vectors = tuple(positions), tuple(vectors)
         self.heading, self.dimensions = heading, dimensions
 
-    def forward(self, sender: Tensor, receiver: Tensor, links: Graph | None = None) -> Tensor:
+    def forward(self, sender: Tensor, receiver: Tensor, graph: Graph | None = None) -> Tensor:
         """Return the senders' data in the receivers' frames [E, D]."""
         columns = list(sender.unbind(-1))
         for first in self.positions:
@@ -190,5 +193,5 @@ class CoordinateFrame(Communication):
         return torch.stack(columns, -1)
 
 
-def _weigh(value: Tensor, links: Graph | None) -> Tensor:
-    return value if links is None or links.weight is None else links.weight.unsqueeze(-1) * value
+def _weigh(value: Tensor, graph: Graph | None) -> Tensor:
+    return value if graph is None or graph.weight is None else graph.weight.unsqueeze(-1) * value

@@ -1,17 +1,18 @@
-"""Exact rewrites of ``sum_j f_pre(f_com(m_j, m_i))``: f_com a plain graph shift, f_pre linear layers and ReLUs.
+"""``sum_j f_pre(f_com(m_j, m_i))`` in fewer operations, for a graph shift as f_com and an f_pre of linear and ReLU.
 
-With y = m_j - m_i and ``f_pre(y) = W3 relu(W2 relu(W1 y + b1) + b2) + b3`` ::
+With y_ij = m_j - m_i and ``f_pre(y) = W3 relu(W2 relu(W1 y + b1) + b2) + b3`` ::
 
     sum_j f_pre(y_ij) = W3 [ sum_j relu(W2 relu(P_j - Q_i) + b2) ] + degree_i b3,    P = W1 m + b1,  Q = W1 m
 
-so that the first and the last layer cost nodes, not links, and only the layers between two ReLUs are left for the
-links. These run in blocks that stay in the processor's cache, in buffers used again for every block, and are computed
-again in the backward pass instead of being stored.
+The result is exactly the same, but the first and the last layer are computed for nodes instead of edges; only the
+layers between two ReLUs remain for the edges. These run in blocks that stay in the processor's cache, in buffers reused
+for every block, and the backward pass recomputes them. The hand-written backward pass takes half the time of
+``torch.utils.checkpoint`` (``python benchmarks/modgnn_speed.py rewrites``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -22,96 +23,101 @@ from torch.nn.functional import embedding_bag
 
 from modgnn_rl.nn.communication import Adjacency, Laplacian
 from modgnn_rl.nn.graph import EdgeList
+from modgnn_rl.utils.internals import has_hooks
 
-__all__ = ["is_linear_map", "rewrite"]
+__all__ = ["fuse", "is_linear_map"]
 
-Rewritten = Callable[[Tensor, Tensor], Tensor]
+FusedSum = Callable[[Tensor, Tensor], Tensor]
 
 
 def is_linear_map(module: nn.Module) -> bool:
-    """Whether a module is an affine map of each row: a linear layer, or one that says so with ``is_linear_map``."""
+    """Whether a module is an affine map of each row: a linear layer, or one whose class sets ``is_linear_map``."""
     return type(module) in (nn.Linear, nn.Identity) or getattr(type(module), "is_linear_map", False)
 
 
-def rewrite(graph: EdgeList, f_com: nn.Module, f_pre: nn.Module) -> Rewritten | None:
-    """A function of the senders' and the receivers' tables [S, D], [R, D] that returns the sum, or None.
+def fuse(graph: EdgeList, f_com: nn.Module, f_pre: nn.Module) -> FusedSum | None:
+    """The sum over incoming edges as a fused function, where there is one.
 
-    None is returned where the modules are of another kind, carry hooks, or weigh links.
+    Args:
+        graph: the edges.
+        f_com: see `modgnn_rl.nn.communication`.
+        f_pre: a plain module.
+
+    Returns:
+        a function of what senders and receivers hold, [S, D] and [R, D], that returns the sums [R, F]. None for other
+        kinds of modules, modules with hooks, weighted edges, and under autocast.
     """
-    if (
-        type(f_com) not in (Laplacian, Adjacency)
-        or graph.weight is not None
-        or torch.is_autocast_enabled(graph.sender.device.type)
-    ):
+    layers = list(_flatten(f_pre))
+    if not _is_supported(graph, f_com, f_pre, layers):
         return None
-    modules = list(_parts(f_pre))
-    kinds = [type(module) is nn.ReLU or is_linear_map(module) for module in modules]
-    if not all(kinds) or any(_is_hooked(module) for module in (f_com, *f_pre.modules())):
-        return None
-    nonlinear = [index for index, module in enumerate(modules) if type(module) is nn.ReLU]
+    relus = [index for index, layer in enumerate(layers) if type(layer) is nn.ReLU]
     is_difference = type(f_com) is Laplacian
-    if not nonlinear:
-        return lambda senders, receivers: _sum_of_linear(graph, modules, senders, receivers if is_difference else None)
-    before, after = modules[: nonlinear[0]], modules[nonlinear[-1] + 1 :]
-    between = [modules[a + 1 : b] for a, b in pairwise(nonlinear)]
-    if not all(len(layers) == 1 and type(layers[0]) is nn.Linear for layers in between):
+    if not relus:
+        return lambda senders, receivers: _sum_of_linear(graph, layers, senders, receivers if is_difference else None)
+    before, after = layers[: relus[0]], layers[relus[-1] + 1 :]
+    between = [layers[a + 1 : b] for a, b in pairwise(relus)]
+    if not all(len(part) == 1 and type(part[0]) is nn.Linear for part in between):
         return None
 
-    def run(senders: Tensor, receivers: Tensor) -> Tensor:
+    def fused_sum(senders: Tensor, receivers: Tensor) -> Tensor:
         incoming = _apply(before, senders)
         own = None
         if is_difference:
-            # W1 m without its bias, which W1 m of the senders has already.
+            # W1 m without its bias, which the senders' W1 m + b1 already contains.
             mine = incoming if receivers is senders else _apply(before, receivers)
             own = mine - _apply(before, receivers.new_zeros(1, receivers.shape[-1]))
         weights = [parameter for (layer,) in between for parameter in (layer.weight, layer.bias)]
-        total = _ReluOverLinks.apply(graph, incoming, own, *weights)
-        return _after_the_sum(graph, after, total)
+        return _map_sum(graph, after, _ReluSum.apply(graph, incoming, own, *weights))
 
-    return run
-
-
-def _sum_of_linear(graph: EdgeList, modules: list[nn.Module], senders: Tensor, receivers: Tensor | None) -> Tensor:
-    """The sum over neighbours of an affine map of a graph shift: sum first, map afterwards."""
-    if len(graph) == 0:
-        total = senders.new_zeros(graph.num_receivers, senders.shape[-1])
-    else:
-        total = embedding_bag(graph.sender, senders, graph.first(), mode="sum")
-    if receivers is not None:
-        total = total - graph.degree().unsqueeze(-1) * receivers
-    return _after_the_sum(graph, modules, total)
+    return fused_sum
 
 
-def _after_the_sum(graph: EdgeList, modules: list[nn.Module], total: Tensor) -> Tensor:
-    """The sum over links of an affine map, from the sum over links of what goes into it."""
-    if not modules:
-        return total
-    constant = _apply(modules, total.new_zeros(1, total.shape[-1]))
-    return _apply(modules, total) + (graph.degree() - 1).unsqueeze(-1) * constant
+def _is_supported(graph: EdgeList, f_com: nn.Module, f_pre: nn.Module, layers: list[nn.Module]) -> bool:
+    return (
+        type(f_com) in (Laplacian, Adjacency)
+        and graph.weight is None
+        and not torch.is_autocast_enabled(graph.sender.device.type)
+        and all(type(layer) is nn.ReLU or is_linear_map(layer) for layer in layers)
+        and not any(has_hooks(module) for module in (f_com, *f_pre.modules()))
+    )
 
 
-def _parts(module: nn.Module) -> Iterator[nn.Module]:
-    """The modules that a nested sequence applies one after the other."""
+def _flatten(module: nn.Module) -> Iterator[nn.Module]:
+    """The modules that nested sequences apply one after another."""
     if type(module) is nn.Sequential:
         for part in module:
-            yield from _parts(part)
+            yield from _flatten(part)
     else:
         yield module
 
 
-def _apply(modules: list[nn.Module], data: Tensor) -> Tensor:
-    for module in modules:
-        data = module(data)
+def _apply(layers: list[nn.Module], data: Tensor) -> Tensor:
+    for layer in layers:
+        data = layer(data)
     return data
 
 
-def _is_hooked(module: nn.Module) -> bool:
-    hooks = (module._forward_hooks, module._forward_pre_hooks, module._backward_hooks, module._backward_pre_hooks)
-    return any(hooks)
+def _sum_of_linear(graph: EdgeList, layers: list[nn.Module], senders: Tensor, receivers: Tensor | None) -> Tensor:
+    """The sum over incoming edges of an affine map of a graph shift: sum first, map afterwards."""
+    if len(graph) == 0:
+        total = senders.new_zeros(graph.num_receivers, senders.shape[-1])
+    else:
+        total = embedding_bag(graph.sender, senders, graph.offsets(), mode="sum")
+    if receivers is not None:
+        total = total - graph.degree().unsqueeze(-1) * receivers
+    return _map_sum(graph, layers, total)
 
 
-class _ReluOverLinks(torch.autograd.Function):
-    """``sum_j relu(... W2 relu(P_j - Q_i) + b2 ...)``: ReLUs and linear layers, a ReLU at both ends.
+def _map_sum(graph: EdgeList, layers: list[nn.Module], total: Tensor) -> Tensor:
+    """The sum over incoming edges of an affine map ``A x + b``, from the sum of x: ``A total + degree b``."""
+    if not layers:
+        return total
+    bias = _apply(layers, total.new_zeros(1, total.shape[-1]))
+    return _apply(layers, total) + (graph.degree() - 1).unsqueeze(-1) * bias
+
+
+class _ReluSum(torch.autograd.Function):
+    """``sum_j relu(... W2 relu(P_j - Q_i) + b2 ...)`` over incoming edges: linear layers between ReLUs.
 
     Inputs: the graph, P [S, H], Q [R, H] or None, then weight and bias (or None) of each linear layer.
     """
@@ -120,12 +126,10 @@ class _ReluOverLinks(torch.autograd.Function):
     def forward(ctx: Any, graph: EdgeList, incoming: Tensor, own: Tensor | None, *weights: Tensor | None) -> Tensor:
         ctx.graph = graph
         ctx.save_for_backward(incoming, own, *weights)
-        layers = _Layers(graph, incoming, own, weights)
-        total = incoming.new_empty(graph.num_receivers, layers.widths[-1])
-        first = graph.first()
-        for receivers, links in graph.blocks():
-            activations = layers.forward(receivers, links)
-            total[receivers] = layers.sum_to_receivers(activations[-1], first[receivers] - links.start)
+        network = _EdgeNetwork(graph, incoming, own, weights)
+        total = incoming.new_empty(graph.num_receivers, network.widths[-1])
+        for receivers, edges in graph.blocks():
+            total[receivers] = network.sum_to_receivers(network.forward(edges)[-1], receivers, edges)
         return total
 
     @staticmethod
@@ -133,43 +137,51 @@ class _ReluOverLinks(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Any:
         graph: EdgeList = ctx.graph
         incoming, own, *weights = ctx.saved_tensors
-        layers = _Layers(graph, incoming, own, weights)
-        gradients = [None if weight is None else torch.zeros_like(weight) for weight in weights]
-        to_senders = torch.zeros_like(incoming)
-        to_receivers = None if own is None else torch.empty_like(own)
-        first, gradient = graph.first(), gradient.contiguous()
-        for receivers, links in graph.blocks():
-            activations = layers.forward(receivers, links)
-            flowing = layers.backward(activations, gradient, links, gradients)
-            to_senders.index_add_(0, graph.sender[links], flowing)
-            if to_receivers is not None:
-                to_receivers[receivers] = layers.sum_to_receivers(flowing, first[receivers] - links.start)
-        return None, to_senders, None if to_receivers is None else to_receivers.neg_(), *gradients
+        network = _EdgeNetwork(graph, incoming, own, weights)
+        of_weights = [None if weight is None else torch.zeros_like(weight) for weight in weights]
+        of_incoming = torch.zeros_like(incoming)
+        of_own = None if own is None else torch.empty_like(own)
+        gradient = gradient.contiguous()
+        for receivers, edges in graph.blocks():
+            of_difference = network.backward(network.forward(edges), gradient, edges, of_weights)
+            of_incoming.index_add_(0, graph.sender[edges], of_difference)
+            if of_own is not None:
+                of_own[receivers] = network.sum_to_receivers(of_difference, receivers, edges)
+        return None, of_incoming, None if of_own is None else of_own.neg_(), *of_weights
 
 
-class _Layers:
-    """The layers over blocks of links, in buffers that all blocks share."""
+class _EdgeNetwork:
+    """The layers between the first and the last ReLU, over blocks of edges, in buffers that all blocks share.
 
-    def __init__(self, graph: EdgeList, incoming: Tensor, own: Tensor | None, weights: Any) -> None:
+    Args:
+        graph: the edges.
+        incoming: the senders' part of the first pre-activation, P [S, H].
+        own: the receivers' part, Q [R, H], or None.
+        weights: weight and bias (or None) of each linear layer.
+    """
+
+    def __init__(self, graph: EdgeList, incoming: Tensor, own: Tensor | None, weights: Sequence[Tensor | None]) -> None:
         self.graph, self.incoming, self.own = graph, incoming, own
-        self.weights, self.biases = weights[::2], weights[1::2]
+        self.weights = [weight for weight in weights[::2] if weight is not None]
+        self.biases = weights[1::2]
         self.transposed = [weight.t().contiguous() for weight in self.weights]
         self.widths = [incoming.shape[1], *(len(weight) for weight in self.weights)]
-        self.longest = max(links.stop - links.start for _, links in graph.blocks())
-        self.order = torch.arange(self.longest, device=incoming.device)
-        self.buffers = [incoming.new_empty(self.longest, width) for width in self.widths]
+        self.block_size = max(edges.stop - edges.start for _, edges in graph.blocks())
+        self.range = torch.arange(self.block_size, device=incoming.device)
+        self.offsets = graph.offsets()
+        self.activations = [incoming.new_empty(self.block_size, width) for width in self.widths]
         self.scratch: dict[tuple[int, int], Tensor] = {}
 
-    def forward(self, receivers: slice, links: slice) -> list[Tensor]:
-        """Activations after each ReLU, for a block of links."""
-        count = links.stop - links.start
-        hidden, *others = (buffer[:count] for buffer in self.buffers)
-        torch.index_select(self.incoming, 0, self.graph.sender[links], out=hidden)
+    def forward(self, edges: slice) -> list[Tensor]:
+        """Activations after each ReLU, for a block of edges."""
+        count = edges.stop - edges.start
+        hidden, *outputs = (buffer[:count] for buffer in self.activations)
+        torch.index_select(self.incoming, 0, self.graph.sender[edges], out=hidden)
         if self.own is not None:
-            mine = self._buffer(0, self.widths[0], count)
-            hidden.sub_(torch.index_select(self.own, 0, self.graph.receiver[links], out=mine))
+            mine = self._scratch(0, self.widths[0], count)
+            hidden.sub_(torch.index_select(self.own, 0, self.graph.receiver[edges], out=mine))
         activations = [hidden.relu_()]
-        for output, weight, bias in zip(others, self.transposed, self.biases, strict=True):
+        for output, weight, bias in zip(outputs, self.transposed, self.biases, strict=True):
             if bias is None:
                 torch.mm(activations[-1], weight, out=output)
             else:
@@ -178,31 +190,44 @@ class _Layers:
         return activations
 
     def backward(
-        self, activations: list[Tensor], gradient: Tensor, links: slice, gradients: list[Tensor | None]
+        self, activations: list[Tensor], gradient: Tensor, edges: slice, of_weights: list[Tensor | None]
     ) -> Tensor:
-        """Gradient of the block's first pre-activation; adds to the gradients of weights and biases."""
-        count, pass_relu = len(activations[0]), torch.ops.aten.threshold_backward.grad_input
-        flowing = self._buffer(0, self.widths[-1], count)
-        torch.index_select(gradient, 0, self.graph.receiver[links], out=flowing)
-        for index in range(len(self.weights), 0, -1):
-            gate = self._buffer(1, self.widths[index], count)
-            pass_relu(flowing, activations[index], 0, grad_input=gate)
-            of_weight, of_bias = gradients[2 * index - 2], gradients[2 * index - 1]
+        """Backpropagate through a block of edges.
+
+        Args:
+            activations: what `forward` returned for this block.
+            gradient: gradient of the receivers' sums [R, F].
+            edges: the block.
+            of_weights: gradients of weights and biases, which this block's are added to.
+
+        Returns:
+            gradient of the first pre-activation ``P_j - Q_i`` [E, H].
+        """
+        count, relu_backward = len(activations[0]), torch.ops.aten.threshold_backward.grad_input
+        upstream = self._scratch(0, self.widths[-1], count)
+        torch.index_select(gradient, 0, self.graph.receiver[edges], out=upstream)
+        for layer in range(len(self.weights), 0, -1):
+            of_output = self._scratch(1, self.widths[layer], count)
+            relu_backward(upstream, activations[layer], 0, grad_input=of_output)
+            of_weight, of_bias = of_weights[2 * layer - 2], of_weights[2 * layer - 1]
             if of_weight is not None:
-                of_weight.addmm_(gate.t(), activations[index - 1])
+                of_weight.addmm_(of_output.t(), activations[layer - 1])
             if of_bias is not None:
-                of_bias += gate.sum(0)
-            flowing = torch.mm(gate, self.weights[index - 1], out=self._buffer(0, self.widths[index - 1], count))
-        return pass_relu(flowing, activations[0], 0, grad_input=self._buffer(1, self.widths[0], count))
+                of_bias += of_output.sum(0)
+            upstream = self._scratch(0, self.widths[layer - 1], count)
+            torch.mm(of_output, self.weights[layer - 1], out=upstream)
+        return relu_backward(upstream, activations[0], 0, grad_input=self._scratch(1, self.widths[0], count))
 
-    def sum_to_receivers(self, values: Tensor, first: Tensor) -> Tensor:
-        """Sum a block's values over the links of each receiver, given where each one's links begin."""
+    def sum_to_receivers(self, values: Tensor, receivers: slice, edges: slice) -> Tensor:
+        """Sum the values of a block of edges over each of its receivers."""
+        offsets = self.offsets[receivers] - edges.start
         if len(values) == 0:
-            return values.new_zeros(len(first), values.shape[-1])
-        return embedding_bag(self.order[: len(values)], values, first, mode="sum")
+            return values.new_zeros(len(offsets), values.shape[-1])
+        return embedding_bag(self.range[: len(values)], values, offsets, mode="sum")
 
-    def _buffer(self, number: int, width: int, count: int) -> Tensor:
+    def _scratch(self, number: int, width: int, count: int) -> Tensor:
+        """One of two buffers of this width, which alternate as input and output."""
         key = (number, width)
         if key not in self.scratch:
-            self.scratch[key] = self.incoming.new_empty(self.longest, width)
+            self.scratch[key] = self.incoming.new_empty(self.block_size, width)
         return self.scratch[key][:count]

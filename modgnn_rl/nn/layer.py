@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -11,31 +12,19 @@ from tensordict.utils import unravel_key
 from torch import Tensor, nn
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.nn.aggregation import Hop, NodeFeatures, aggregate, call, suited_form
+from modgnn_rl.nn.aggregation import NodeFeatures, NodeInputs, aggregate, call_submodule, resolve_form
 from modgnn_rl.nn.communication import GraphShift, Laplacian
-from modgnn_rl.nn.graph import AGGREGATIONS, Graph
+from modgnn_rl.nn.delay import STARTS, previous_step
+from modgnn_rl.nn.graph import AGGREGATIONS
 from modgnn_rl.nn.topology import Topology
-from modgnn_rl.utils.tensors import flatnonzero, mask_rows, stack_padded
+from modgnn_rl.nn.window import Recorder, Window, call_where, mask_invalid, select
+from modgnn_rl.utils.tensors import mask_rows, stack_padded
 
-__all__ = ["STARTS", "ModGNNLayer", "Recorder", "only_finite"]
+__all__ = ["ModGNNLayer"]
 
 Submodule = nn.Module | None
 PerHop = Submodule | Sequence[Submodule]
-STARTS = ("mask", "zero", "repeat")
 PER_HOP = {"f_com": 1, "f_pre": 0, "f_mid": 0}  # submodules that may differ between hops, and their first hop
-
-
-class Recorder(Protocol):
-    """Takes intermediate results that somebody asked for."""
-
-    def wants(self, name: str, hop: int | None = None) -> bool:
-        """Whether the result of this name is asked for."""
-
-    def nodes(self, name: str, hop: int | None, value: Tensor) -> None:
-        """Take a result of all agents [R, F]."""
-
-    def links(self, name: str, hop: int, value: Tensor, graph: Graph) -> None:
-        """Take a result of all links [E, F]."""
 
 
 class ModGNNLayer(nn.Module):
@@ -47,39 +36,39 @@ class ModGNNLayer(nn.Module):
         m_i^(k)(t)  = sum_j y_ij^(k)(t),                                        k = 1..K-1
         x_i(t)      = f_final( f_mid^(0)(f_pre^(0)(c_i(t))) + sum_k f_mid^(k)( sum_j f_pre^(k)(y_ij^(k)(t)) ) )
 
-    A submodule that is left out is the identity. Each may be a plain module or a TensorDictModule with keys of its own,
-    whose out-key, or the last of several, is the result. It reads ``"data"`` (what a plain module would get; f_com
-    instead ``"sender"`` and ``"receiver"``), and anything of
+    A submodule that is left out is the identity. Each may be a plain module or a TensorDictModule with its own keys,
+    whose last out-key is the result. It reads ``"data"``, the input that a plain module would get (f_com reads
+    ``"sender"`` and ``"receiver"`` instead), and any of
 
-    - ``("own", name)``: the agent's own data at time t (in f_com and f_pre: the receiver's), for example
-      ``("own", "observation")``, or another name that lies beside the observation;
-    - ``"input"``: the agent's own input of this layer at time t, observation and outputs of earlier layers;
-    - in f_com and f_pre, ``("link", "weight")`` and ``("link", "feature")``.
+    - ``("own", name)``: the agent's own data at time t (in f_com and f_pre, the receiver's), for example
+      ``("own", "observation")`` or another entry beside the observation;
+    - ``"input"``: the agent's own input to this layer at time t, observation and outputs of earlier layers;
+    - in f_com and f_pre, ``("edge", "weight")`` and ``("edge", "feature")``.
 
-    On a built layer a submodule is an attribute like any other: ``layer.f_final = module``, ``layer.f_pre[1] = module``
-    for one hop, ``layer.f_pre = module`` for all hops. One module in several places has one set of weights.
+    Submodules can be replaced after construction like any attribute: ``layer.f_final = module``,
+    ``layer.f_pre[1] = module`` for one hop, ``layer.f_pre = module`` for all hops. One module in several places shares
+    its weights between them.
 
-    What an agent sees that is not finite is not sent, and its output at that step is NaN; so nothing of it reaches
-    others, nor the gradients.
+    An agent whose observation contains NaN or infinity sends nothing, and its output at that step is NaN, so that
+    these values reach neither other agents nor the gradients.
 
     Args:
         hops: number of hops K >= 0.
         f_input: encodes the observation.
-        f_com: what an agent makes of one incoming message, see `modgnn_rl.nn.communication`; one module for all hops,
-            or
-            a list of K. Default: the Laplacian, incoming minus own.
+        f_com: what an agent computes from one incoming message, see `modgnn_rl.nn.communication`; one module for all
+            hops, or a list of K. Default: the Laplacian, incoming minus own.
         f_pre: applied to each incoming datum before the sum over neighbours; one module for all hops, or a list of
             K + 1 (``None`` in it is the identity).
         f_mid: applied to each hop's sum; one module or a list of K + 1.
         f_final: applied to the sum over hops.
-        start: what stands for data that an agent does not hold yet. ``mask``: the hop contributes nothing; ``zero``:
-            the data are zero; ``repeat``: the first observation and graph are repeated backwards.
-        aggregation: what is written as a sum over the neighbours above: ``sum``, ``mean`` or ``max``; zero for an agent
-            without neighbours.
+        start: what stands in for data that an agent does not hold yet. ``mask``: the hop contributes nothing; ``zero``:
+            the data are zero; ``repeat``: the first observation and graph are repeated backwards in time.
+        aggregation: ``sum``, ``mean`` or ``max`` over the neighbours, where the equations above have a sum; zero for an
+            agent without neighbours.
 
     Raises:
-        InputError: on a negative or fractional ``hops``, a list of the wrong length, an unknown ``start`` or
-            ``aggregation``.
+        InputError: ``hops`` is negative or not an integer, a list has the wrong length, or ``start`` or ``aggregation``
+            is unknown.
     """
 
     f_input: nn.Module
@@ -121,7 +110,7 @@ class ModGNNLayer(nn.Module):
 
     @property
     def submodules(self) -> Iterable[nn.Module]:
-        """F_input, f_com of each hop, f_pre and f_mid of each hop, f_final."""
+        """f_input, f_com of each hop, f_pre and f_mid of each hop, f_final."""
         return self.f_input, *self.f_com, *self.f_pre, *self.f_mid, self.f_final
 
     @property
@@ -135,8 +124,8 @@ class ModGNNLayer(nn.Module):
         return {key[1:] for key in keys if isinstance(key, tuple) and key[0] == group}
 
     @property
-    def results(self) -> list[tuple[str, ...]]:
-        """Names of the intermediate results that a recorder may want, with their hops."""
+    def intermediate_names(self) -> list[tuple[str, ...]]:
+        """Names of the intermediate results that a `Recorder` may request, with their hops."""
         hops = {"messages": range(self.hops), "f_com": range(1, self.hops + 1)}
         names = ("messages", "f_com", "f_pre", "sum", "f_mid")
         numbered = [(name, str(hop)) for name in names for hop in hops.get(name, range(self.hops + 1))]
@@ -144,7 +133,7 @@ class ModGNNLayer(nn.Module):
 
     @property
     def sends_plain_data(self) -> bool:
-        """Whether messages are sums of observations, so that stored ones never grow stale and turn as vectors do."""
+        """Whether messages are sums of observations: stored ones never become stale, and they rotate as vectors do."""
         plain = all(isinstance(f_com, GraphShift) for f_com in self.f_com[: self.hops - 1])
         return isinstance(self.f_input, nn.Identity) and (self.hops <= 1 or (plain and self.aggregation != "max"))
 
@@ -163,156 +152,113 @@ class ModGNNLayer(nn.Module):
 
         Args:
             observation: o [*B, T, N, F].
-            adjacency: the graphs of all steps, in any form that `Topology` takes, or the Topology itself, which then
-                also knows the receivers.
-            is_init: steps at which an episode begins, bool [*B, T]; default: none does.
-            messages: the messages of the step before the window [*B, N, K, D]; a hop that an agent does not hold is
-                NaN. Default: nobody holds anything.
+            adjacency: the graphs of all steps, in any form that `Topology` reads, or a Topology, which then also knows
+                the receivers.
+            is_init: steps at which an episode begins, bool [*B, T]; default: none.
+            messages: the messages of the step before the window [*B, N, K, D]; NaN for a hop that an agent does not
+                hold. Default: nobody holds anything.
             own: further data of the agents for keyed submodules [*B, T, N, ...].
-            receivers: the agents and steps whose output is wanted, bool [*B, T, N]; the others cost nothing but their
-                messages and get zeros. Default: all.
-            record: takes intermediate results.
+            receivers: the agents and steps whose output is wanted, bool [*B, T, N]; for the others, only messages are
+                computed, and the output is zero. Default: all.
+            record: collects intermediate results.
 
         Returns:
             x [*B, T, N, O], and the messages sent at each step [*B, T, N, K, D].
+
+        Raises:
+            InputError: the graphs do not match the observations, or lack what a submodule reads.
         """
-        shape = observation.shape[:-1]
-        if isinstance(adjacency, Tensor):
-            adjacency = Topology(adjacency, shape[-1], receivers=receivers, form=suited_form("auto", self))
-        topology, rows = adjacency, adjacency.rows
-        if topology.num_nodes != shape.numel():
-            flocks = topology.num_nodes // max(shape[-1], 1)
-            raise InputError(f"there are {flocks} graphs for observations {list(shape)} of flocks; each needs its own")
-        for (name,) in self._keys_under("link"):
-            if getattr(topology, name, None) is None:
-                raise InputError(f"a submodule reads ('link', '{name}'), and the links have no {name}; see link_{name}")
-        flat = {("own", *key): value.flatten(0, len(shape) - 1) for key, value in (own or {}).items()}
-        seen, flat, sees = only_finite(observation.reshape(shape.numel(), observation.shape[-1]), flat, topology.exists)
-        flat[("input",)] = seen
-
-        # Modules may work in place; what they are given here is read again.
-        data, held = _call_for(topology.exists, topology, self.f_input, seen.clone(), flat), sees
-        _record(record, "f_input", None, data)
-        mine = {key: _take(value, rows) for key, value in flat.items()}
-        processed = call(self.f_pre[0], _take(data, rows).clone(), mine)
-        _record(record, "f_pre", 0, processed)
-        total = self._contribution(0, processed, mine, None, topology, record)
-        first = data  # of start="repeat"
-        sent = []
+        window = self._make_window(observation, adjacency, own, receivers, record)
+        # Submodules may work in place, so they get a copy of what is read again.
+        data = call_where(window.topology.exists, window, self.f_input, window.inputs.clone(), window.own)
+        window.record("f_input", None, data)
+        held, start = window.valid, STARTS[self.start](data, window.valid)
+        pass_on = functools.partial(self._pass_on, window)
+        total = self._hop_zero(data, window)
+        sent: list[Tensor] = []
         for hop in range(1, self.hops + 1):
-            sent.append(mask_rows(data, held, torch.nan).to(seen.dtype))
-            _record(record, "messages", hop - 1, sent[-1])
+            sent.append(mask_rows(data, held, torch.nan).to(observation.dtype))
+            window.record("messages", hop - 1, sent[-1])
             stored = None if messages is None else messages[..., hop - 1, : data.shape[-1]]
-            before, held = _one_step_earlier(data, held, stored, is_init, shape)
-            if self.start == "repeat":
-                known = sees & first.isfinite().all(-1)
-                before, held = torch.where((held | ~known).unsqueeze(-1), before, first), held | known
-            elif self.start == "zero":
-                held = torch.ones_like(held)
-            graph = topology.target_edges().between(held, _take(held, rows))
-            incoming = Hop(before, _take(before, rows), mine)
-            summed = self._summed(hop, self.f_pre[hop], graph, incoming, record)
-            total = total + self._contribution(hop, summed, mine, _take(held, rows), topology, record)
+            shifted = previous_step(data.unflatten(0, window.shape), held.unflatten(0, window.shape), stored, is_init)
+            before, held = start.fill(*shifted)
+            total = total + self._hop_output(hop, before, held, window)
             if hop < self.hops:
-                everyone = topology.all_edges()
-                data = self._summed(hop, None, everyone.between(held, held), Hop(before, before, flat))
-                if self.start == "repeat":
-                    first = self._summed(hop, None, everyone.between(known, known), Hop(first, first, flat))
-                if topology.exists is not None:
-                    held = held & topology.exists
+                data = pass_on(hop, before, held)
+                start.advance(hop, pass_on)
+                held = held if window.topology.exists is None else held & window.topology.exists
+        output = self._output(total, window)
+        all_sent = stack_padded(sent) if sent else data.new_zeros(len(data), 0, data.shape[-1])
+        return output.unflatten(0, window.shape), all_sent.unflatten(0, window.shape)
 
-        output = call(self.f_final, total, mine)
-        output = mask_rows(output, _take(sees, rows), torch.nan)
-        if rows is not None:
-            output = output.new_zeros(shape.numel(), output.shape[-1]).index_copy(0, rows, output)
-        elif topology.wanted_nodes is not None:
-            output = mask_rows(output, topology.wanted_nodes)
-        _record(record, "f_final", None, output)
-        messages = stack_padded(sent) if sent else data.new_zeros(shape.numel(), 0, data.shape[-1])
-        return output.unflatten(0, shape), messages.unflatten(0, shape)
-
-    def _summed(
-        self, hop: int, f_pre: nn.Module | None, graph: Graph, incoming: Hop, record: Recorder | None = None
-    ) -> Tensor:
-        """Aggregate one hop's incoming messages over the neighbours; without f_pre, what the agent will pass on."""
-        take = None
-        if record is not None and (record.wants("f_com", hop) or record.wants("f_pre", hop)):
-            recorder = record
-
-            def take(name: str, value: Tensor) -> None:
-                if recorder.wants(name, hop):
-                    recorder.links(name, hop, value, graph)
-
-        module = nn.Identity() if f_pre is None else f_pre
-        return aggregate(graph, self.f_com[hop - 1], module, incoming, self.aggregation, take)
-
-    def _contribution(
+    def _make_window(
         self,
-        hop: int,
-        summed: Tensor,
-        mine: NodeFeatures,
-        held: Tensor | None,
-        topology: Topology,
+        observation: Tensor,
+        adjacency: Tensor | Topology,
+        own: NodeFeatures | None,
+        receivers: Tensor | None,
         record: Recorder | None,
-    ) -> Tensor:
-        """F_mid of one hop's sum; zero for agents that hold no such hop."""
-        _record(record, "sum", hop, summed)
-        result = _call_for(held, topology, self.f_mid[hop], summed, mine)
-        _record(record, "f_mid", hop, result)
+    ) -> Window:
+        """Flatten the data of a window to nodes, and check them against the graphs."""
+        shape = observation.shape[:-1]
+        topology = adjacency
+        if isinstance(topology, Tensor):
+            topology = Topology(topology, shape[-1], receivers=receivers, form=resolve_form("auto", self))
+        if topology.num_nodes != shape.numel():
+            raise InputError(
+                f"there are {topology.num_graphs} graphs for observations {list(shape)} (batch, steps, agents); each "
+                "step of each flock needs one"
+            )
+        for (name,) in self._keys_under("edge"):
+            if getattr(topology, name, None) is None:
+                raise InputError(f"a submodule reads ('edge', '{name}'), but the edges have no {name}; see edge_{name}")
+        nodes = {("own", *key): value.flatten(0, len(shape) - 1) for key, value in (own or {}).items()}
+        inputs = observation.reshape(shape.numel(), observation.shape[-1])
+        inputs, nodes, valid = mask_invalid(inputs, nodes, topology.exists)
+        nodes["input",] = inputs
+        target_own = {key: select(value, topology.target_index) for key, value in nodes.items()}
+        return Window(shape, topology, valid, nodes, target_own, record)
+
+    def _hop_zero(self, data: Tensor, window: Window) -> Tensor:
+        """``f_mid^(0)(f_pre^(0)(c_i))`` of the targets."""
+        processed = call_submodule(self.f_pre[0], window.of_targets(data).clone(), window.target_own)
+        window.record("f_pre", 0, processed)
+        return self._contribution(0, processed, None, window)
+
+    def _hop_output(self, hop: int, before: Tensor, held: Tensor, window: Window) -> Tensor:
+        """``f_mid^(k)(sum_j f_pre^(k)(y_ij))`` of the targets, from what all nodes held one step earlier."""
+        target_held = window.of_targets(held)
+        graph = window.topology.target_edges().subgraph(held, target_held)
+        inputs = NodeInputs(before, window.of_targets(before), window.target_own)
+        record = window.edge_recorder(hop, graph)
+        summed = aggregate(graph, self.f_com[hop - 1], self.f_pre[hop], inputs, self.aggregation, record)
+        return self._contribution(hop, summed, target_held, window)
+
+    def _contribution(self, hop: int, summed: Tensor, held: Tensor | None, window: Window) -> Tensor:
+        """F_mid of one hop's sum; zero for targets that do not hold this hop."""
+        window.record("sum", hop, summed)
+        result = call_where(held, window, self.f_mid[hop], summed, window.target_own)
+        window.record("f_mid", hop, result)
         return result
 
+    def _pass_on(self, window: Window, hop: int, before: Tensor, held: Tensor) -> Tensor:
+        """``m_i^(k) = sum_j y_ij``, what every node will send next, from what all nodes held one step earlier."""
+        graph = window.topology.all_edges().subgraph(held, held)
+        inputs = NodeInputs(before, before, window.own)
+        return aggregate(graph, self.f_com[hop - 1], nn.Identity(), inputs, self.aggregation)
 
-def _call_for(who: Tensor | None, topology: Topology, module: nn.Module, data: Tensor, own: NodeFeatures) -> Tensor:
-    """Apply a submodule for some agents, bool [R], or all; zeros for the others, whose rows no batch statistics see."""
-    if who is None:
-        return call(module, data, own)
-    if topology.as_pairs or who.all():
-        return mask_rows(call(module, data, own), who)
-    rows = flatnonzero(who)
-    result = call(module, _take(data, rows), {key: _take(value, rows) for key, value in own.items()})
-    return result.new_zeros(len(data), *result.shape[1:]).index_copy(0, rows, result)
-
-
-def _take(table: Tensor, rows: Tensor | None) -> Tensor:
-    return table if rows is None else table.index_select(0, rows)
-
-
-def _record(record: Recorder | None, name: str, hop: int | None, value: Tensor) -> None:
-    if record is not None and record.wants(name, hop):
-        record.nodes(name, hop, value)
-
-
-def only_finite(
-    observation: Tensor, own: NodeFeatures, exists: Tensor | None = None
-) -> tuple[Tensor, dict[tuple[str, ...], Tensor], Tensor]:
-    """Zero all data of agents that see anything not finite or do not exist, bool [R]; also returns the others."""
-    sees = observation.isfinite().all(-1)
-    if exists is not None:
-        sees = sees & exists
-    for value in own.values():
-        sees = sees & value.isfinite().flatten(1).all(-1)
-    clean = {key: mask_rows(value, sees) for key, value in own.items()}
-    return mask_rows(observation, sees), clean, sees
-
-
-def _one_step_earlier(
-    data: Tensor, held: Tensor, stored: Tensor | None, is_init: Tensor | None, shape: torch.Size
-) -> tuple[Tensor, Tensor]:
-    """What the agents [*B, T, N] held one step earlier, [R, D], zero where they held nothing, and who held it [R].
-
-    What was stored comes first in the window; at the start of episodes nobody holds anything, and never what is not
-    finite.
-    """
-    window, holds = data.unflatten(0, shape), held.unflatten(0, shape)
-    stored_held = torch.full_like(holds[..., 0, :], stored is not None)
-    if stored is None:
-        stored = torch.zeros_like(window[..., 0, :, :])
-    before = torch.cat((stored.unsqueeze(-3), window[..., :-1, :, :]), -3)
-    held_before = torch.cat((stored_held.unsqueeze(-2), holds[..., :-1, :]), -2) & before.isfinite().all(-1)
-    if is_init is not None:
-        held_before = held_before & ~is_init.unsqueeze(-1)
-    before, held_before = before.flatten(0, -2), held_before.flatten()
-    return mask_rows(before, held_before), held_before
+    def _output(self, total: Tensor, window: Window) -> Tensor:
+        """F_final of the sum over hops: NaN for invalid targets, zero for nodes that are not targets."""
+        topology = window.topology
+        output = call_submodule(self.f_final, total, window.target_own)
+        output = mask_rows(output, window.of_targets(window.valid), torch.nan)
+        if topology.target_index is not None:
+            zeros = output.new_zeros(topology.num_nodes, output.shape[-1])
+            output = zeros.index_copy(0, topology.target_index, output)
+        elif topology.targets is not None:
+            output = mask_rows(output, topology.targets)
+        window.record("f_final", None, output)
+        return output
 
 
 def _per_hop(name: str, module: PerHop, hops: int) -> nn.ModuleList:

@@ -19,7 +19,7 @@ from torch.nn.functional import pad
 from torchrl.modules import recurrent_mode
 
 from modgnn_rl.errors import InputError, suggestion
-from modgnn_rl.nn.aggregation import suited_form
+from modgnn_rl.nn.aggregation import resolve_form
 from modgnn_rl.nn.graph import Graph
 from modgnn_rl.nn.layer import ModGNNLayer
 from modgnn_rl.nn.primer import RecurrentStatePrimer
@@ -56,8 +56,8 @@ class ModGNN(TensorDictModuleBase):
         action: key that the output is written to [*B, N, O].
         mask: key of the agents that exist, bool [*B, N], read where there is one. Nobody hears of the others, whatever
             their data are; their actions are zero, and one that comes (back) starts with nothing.
-        link_weight: key of the links' weights, [*B, N, N] or of an edge list [*B, E].
-        link_feature: key of the links' features, [*B, N, N, F] or [*B, E, F].
+        edge_weight: key of the links' weights, [*B, N, N] or of an edge list [*B, E].
+        edge_feature: key of the links' features, [*B, N, N, F] or [*B, E, F].
         own: where ``("own", name)`` of a keyed submodule is found, by name; default: beside the observation.
         form: ``links`` (a list: costs what is linked), ``pairs`` (all pairs: shapes do not depend on data, and batch
             statistics see them all), ``auto``.
@@ -73,8 +73,8 @@ class ModGNN(TensorDictModuleBase):
         messages: str = "messages",
         action: NestedKey = ("agents", "action"),
         mask: NestedKey = ("agents", "mask"),
-        link_weight: NestedKey | None = None,
-        link_feature: NestedKey | None = None,
+        edge_weight: NestedKey | None = None,
+        edge_feature: NestedKey | None = None,
         own: Mapping[NestedKey, NestedKey] | None = None,
         form: str = "auto",
     ) -> None:
@@ -86,7 +86,7 @@ class ModGNN(TensorDictModuleBase):
         self.form = form
         self.messages_key = messages
         self._keys: list[NestedKey] = [observation, adjacency, is_init, messages, mask]
-        self._link_keys = {"weight": link_weight, "feature": link_feature}
+        self._edge_keys = {"weight": edge_weight, "feature": edge_feature}
         self._found = {_as_tuple(name): key for name, key in (own or {}).items()}
         self._requests: dict[tuple[str, ...], NestedKey] = {}
         self.out_keys: list[NestedKey] = [action, ("next", messages)]
@@ -95,7 +95,7 @@ class ModGNN(TensorDictModuleBase):
     @property
     def in_keys(self) -> list[NestedKey]:
         """What is read; ``is_init``, ``messages`` and the mask may be missing."""
-        keys = [*self._keys, *(key for key in self._link_keys.values() if key is not None)]
+        keys = [*self._keys, *(key for key in self._edge_keys.values() if key is not None)]
         return [*keys, *(key for key in self._own_keys().values() if key not in keys)]
 
     @property
@@ -135,7 +135,8 @@ class ModGNN(TensorDictModuleBase):
         that are not computed get zeros: those that do not exist, and but for ``f_input`` and ``messages`` those whose
         action is not wanted; messages that are not held are NaN.
         """
-        return [("layers", str(number), *name) for number, layer in enumerate(self.layers) for name in layer.results]
+        names = [(str(number), *name) for number, layer in enumerate(self.layers) for name in layer.intermediate_names]
+        return [("layers", *name) for name in names]
 
     def request(self, *keys: NestedKey, rename: Mapping[NestedKey, NestedKey] | None = None) -> Self:
         """Ask for intermediate results, which are then written beside the action; nothing is computed twice for it.
@@ -180,7 +181,7 @@ class ModGNN(TensorDictModuleBase):
         is_init, messages, mask = (tensordict.get(key, None) for key in self._keys[2:])
         agents = observation.shape[:-1]
         own = {name: _needed(tensordict, key, name) for name, key in self._own_keys().items()}
-        of_links = {name: None if key is None else _needed(tensordict, key) for name, key in self._link_keys.items()}
+        of_links = {name: None if key is None else _needed(tensordict, key) for name, key in self._edge_keys.items()}
         flocks, links = agents[:-1], {f"the {name} of links": value for name, value in of_links.items()}
         _check_begin(flocks, {"the adjacency": adjacency, **links})
         _check_begin(agents, {f"'{_dotted(name)}' (read under 'own')": value for name, value in own.items()})
@@ -193,8 +194,7 @@ class ModGNN(TensorDictModuleBase):
             receivers=receivers,
             mask=mask,
             **of_links,
-            form=suited_form(self.form, self),
-            keep_positions=bool(self._requests),
+            form=resolve_form(self.form, self),
         )
         if recurrent_mode():
             messages = None if messages is None or is_init is None else messages.select(observation.ndim - 3, 0)
@@ -309,9 +309,9 @@ class _Requested:
         """Whether the result of this name is asked for."""
         return self._key(name, hop) in self.asked
 
-    def nodes(self, name: str, hop: int | None, value: Tensor) -> None:
+    def record_nodes(self, name: str, hop: int | None, value: Tensor) -> None:
         """Take a result of all agents, or of the wanted ones [R, F]."""
-        rows, wanted = self.topology.rows, self.topology.wanted_nodes
+        rows, wanted = self.topology.target_index, self.topology.targets
         if name in ("f_input", "messages") or wanted is None:
             pass  # all agents send
         elif rows is None or len(value) == self.topology.num_nodes:
@@ -321,9 +321,9 @@ class _Requested:
         # A copy, since the next module may work in place.
         self.results[self._key(name, hop)] = value.reshape(*self.agents, value.shape[-1]).clone()
 
-    def links(self, name: str, hop: int, value: Tensor, graph: Graph) -> None:
+    def record_edges(self, name: str, hop: int, value: Tensor, graph: Graph) -> None:
         """Take a result of all links [E, F]."""
-        spread = self.topology.spread_links(value, graph)
+        spread = self.topology.to_input_layout(value, graph)
         self.results[self._key(name, hop)] = spread.reshape(*self.agents[:-1], *spread.shape[1:])
 
     def _key(self, name: str, hop: int | None) -> tuple[str, ...]:

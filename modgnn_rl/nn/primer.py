@@ -1,6 +1,7 @@
 """Recurrent state of agents in TorchRL environments.
 
-A vector that an agent does not hold (at the start of an episode, after a reboot) is NaN; `missing` makes such a state.
+NaN stands for a vector that an agent does not hold, at the start of an episode or after a reboot; `missing` makes such
+a state.
 """
 
 from __future__ import annotations
@@ -23,53 +24,53 @@ __all__ = ["RecurrentStatePrimer", "missing"]
 
 
 def missing(like: Tensor) -> Tensor:
-    """A state of the shape of ``like`` that says that nothing is held."""
+    """A state of the shape of ``like`` in which nothing is held."""
     return torch.full_like(like, torch.nan)
 
 
 class RecurrentStatePrimer(TensorDictPrimer):
     """Primer whose shapes follow the environment that it is appended to, so that a module serves any number of agents.
 
-    It adds the keys to the environment's specs and zeroes them at resets; modules look at ``is_init`` and read no cache
-    there.
+    It adds the state to the environment's specs and zeroes it at resets. The module must check ``is_init``, and ignore
+    the state where an episode begins.
 
     Args:
-        module: the module that owns the state; run once on the zero observation to learn the shapes.
-        keys: the root keys of its state, which it writes under ``"next"``.
-        is_init: the key under which the module looks whether an episode begins.
+        module: the module that owns the state; it runs once on the zero observation to infer the shapes.
+        keys: root keys of the state, which the module writes under ``"next"``.
+        is_init: key of the flag that an episode begins.
 
     Raises:
-        InputError: when it is appended, if the module needs data that the environment does not have.
+        InputError: when it is appended, if the module needs data that the environment does not provide.
     """
 
     def __init__(self, module: TensorDictModuleBase, keys: Sequence[str], *, is_init: NestedKey = "is_init") -> None:
         super().__init__(primers=Composite({key: Unbounded(()) for key in keys}), expand_specs=False)
         self._keys, self._is_init = tuple(keys), is_init
-        # A bound method, since the module must not become a part of the environment; None once the shapes are known.
+        # A bound method, because the module must not become a submodule of the environment; None once shapes are known.
         self._run_once: Callable[[TensorDictBase], TensorDictBase] | None = module.forward
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Size the state by the environment's observations, then add it to the spec."""
-        self._size()
+        """Infer the state's shapes from the environment's observations, then add it to the spec."""
+        self._infer_shapes()
         return super().transform_observation_spec(observation_spec)
 
     def _reset_func(self, *args: Any, **kwargs: Any) -> Any:
-        self._size()
+        self._infer_shapes()
         return super()._reset_func(*args, **kwargs)
 
-    def _size(self) -> None:
+    def _infer_shapes(self) -> None:
         if self._run_once is None:
             return
         spec = self.parent.observation_spec
-        seen = spec.zero()
-        seen[self._is_init] = torch.ones(*spec.shape, 1, dtype=torch.bool, device=spec.device)
+        data = spec.zero()
+        data[self._is_init] = torch.ones(*spec.shape, 1, dtype=torch.bool, device=spec.device)
         try:
             with torch.no_grad(), set_recurrent_mode(False):
-                state = self._run_once(seen)["next"]
+                state = self._run_once(data)["next"]
         except InputError as error:
             raise InputError(
-                f"the policy cannot run on what the environment emits ({error}); what is made of observations must be "
-                "made by a transform that is appended before the policy's memory"
+                f"the policy cannot read the environment's observations ({error}); a transform that prepares them must "
+                "be appended before the policy's primer"
             ) from error
         like = {key: state[key] for key in self._keys}
         specs = {key: Unbounded(value.shape, device=value.device, dtype=value.dtype) for key, value in like.items()}

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["parallel_env_processes", "parse_hydra_flags"]
+if TYPE_CHECKING:
+    from torch import nn
+
+__all__ = ["has_hooks", "is_functorch_active", "parallel_env_processes", "parse_hydra_flags"]
 
 
 def parse_hydra_flags(arguments: Sequence[str]) -> argparse.Namespace:
@@ -40,3 +43,23 @@ def parallel_env_processes(env: Any) -> list[Any]:
     others at once: `ParallelEnv.close` waits for workers that are busy.
     """
     return list(env._workers)
+
+
+def has_hooks(module: nn.Module) -> bool:
+    """Whether calling a module also calls hooks, forward or backward, that someone registered on it.
+
+    PyTorch registers and removes hooks in public but does not list them. `modgnn_rl.nn.fused` computes layers without
+    calling their modules, and must not where hooks wait for the call.
+    """
+    return any((module._forward_hooks, module._forward_pre_hooks, module._backward_hooks, module._backward_pre_hooks))
+
+
+def is_functorch_active() -> bool:
+    """Whether a transform of ``torch.func`` (``vmap``, ``grad``, ...) is running.
+
+    PyTorch has no public name for it. Under such a transform shapes must not depend on data, so that graphs have to be
+    dense and NumPy cannot be used.
+    """
+    import torch
+
+    return torch._C._functorch.maybe_current_level() is not None

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from modgnn_rl.utils.internals import is_functorch_active
+
 __all__ = [
     "clip_to_ball",
     "flatnonzero",
@@ -27,7 +29,7 @@ PAIRS_IN_BLOCK_ELSEWHERE = 2**24
 
 def is_transformed() -> bool:
     """Whether a compiler or a transform of ``torch.func`` is at work, under which shapes must not depend on data."""
-    return torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None
+    return torch.compiler.is_compiling() or is_functorch_active()
 
 
 def flatnonzero(mask: Tensor) -> Tensor:

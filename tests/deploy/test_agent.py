@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from modgnn_rl import Agent, ModGNN, ModGNNLayer, make_model
-from modgnn_rl.deploy.agent import LinkData, step
+from modgnn_rl.deploy.agent import EdgeData, step
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.communication import (
     Adjacency,
@@ -34,10 +34,10 @@ LOCAL_STARTS = ("mask", "zero")
 class Rollout:
     """Random observations, graphs and mishaps, flown by the policy for all agents and by the agents themselves."""
 
-    def __init__(self, policy: ModGNN, seed: int, links: LinkData | None = None, dtype: torch.dtype = torch.float64):
+    def __init__(self, policy: ModGNN, seed: int, links: EdgeData | None = None, dtype: torch.dtype = torch.float64):
         self.policy = policy.to(dtype).eval()
         self.generator = torch.Generator().manual_seed(seed)
-        self.links, self.dtype = links or LinkData(), dtype
+        self.links, self.dtype = links or EdgeData(), dtype
         self.agents = [Agent(self.policy, links) for _ in range(AGENTS)]
         self.own_names = {name for layer in policy.layers for name in layer.own_keys} - {("observation",)}
         self.existed = torch.zeros(AGENTS, dtype=torch.bool)
@@ -152,16 +152,16 @@ def full_layer(hops: int, f_com: nn.Module | Sequence[nn.Module] | None, inputs:
     return ModGNNLayer(hops, f_input, f_com, f_pre, f_mid, f_final, **options)
 
 
-COMMUNICATIONS: dict[str, tuple[Callable[[], nn.Module], LinkData]] = {
-    "plain": (Laplacian, LinkData()),
-    "weighted": (Adjacency, LinkData(weight=True)),
-    "normalised": (NormalizedAdjacency, LinkData(weight=True)),
-    "frame": (lambda: CoordinateFrame(heading=3), LinkData()),
-    "attention": (lambda: GraphAttention(WIDTH, WIDTH, heads=2), LinkData()),
-    "network": (lambda: _Pairwise(WIDTH), LinkData()),
+COMMUNICATIONS: dict[str, tuple[Callable[[], nn.Module], EdgeData]] = {
+    "plain": (Laplacian, EdgeData()),
+    "weighted": (Adjacency, EdgeData(weight=True)),
+    "normalised": (NormalizedAdjacency, EdgeData(weight=True)),
+    "frame": (lambda: CoordinateFrame(heading=3), EdgeData()),
+    "attention": (lambda: GraphAttention(WIDTH, WIDTH, heads=2), EdgeData()),
+    "network": (lambda: _Pairwise(WIDTH), EdgeData()),
     "messages": (
         lambda: MessagePassing(dense(2 * WIDTH + 1 + LINK_FEATURES, WIDTH)),
-        LinkData(weight=True, feature=LINK_FEATURES),
+        EdgeData(weight=True, feature=LINK_FEATURES),
     ),
 }
 
@@ -183,7 +183,7 @@ def test_agents_fly_as_the_policy_does(
     for number, count in enumerate(hops):
         f_com = [make() for _ in range(count)]
         layers.append(full_layer(count, f_com, FEATURES + 3 * number, start=start, aggregation=aggregation))
-    Rollout(ModGNN(layers, link_feature="feature" if links.feature else None), seed, links).run()
+    Rollout(ModGNN(layers, edge_feature="feature" if links.feature else None), seed, links).run()
 
 
 @pytest.mark.parametrize(("hops", "layers"), [(0, 1), (1, 1), (3, 1), (2, 2)])
@@ -243,14 +243,14 @@ def test_an_agent_begins_with_nothing_and_may_reuse_its_buffers() -> None:
 
 
 def test_the_keys_of_a_policy_say_whether_links_have_weights() -> None:
-    assert Agent(policy()).links == LinkData()
-    assert Agent(policy(link_weight="weight")).links == LinkData(weight=True)
-    with pytest.raises(InputError, match=r"say how many, as in links=LinkData\(feature=2\)"):
-        Agent(policy(link_feature="feature"))
+    assert Agent(policy()).links == EdgeData()
+    assert Agent(policy(edge_weight="weight")).links == EdgeData(weight=True)
+    with pytest.raises(InputError, match=r"say how many, as in links=EdgeData\(feature=2\)"):
+        Agent(policy(edge_feature="feature"))
 
 
 def test_nobody_is_heard_whatever_is_known_of_links() -> None:
-    agent = Agent(policy(), LinkData(weight=True, feature=2))
+    agent = Agent(policy(), EdgeData(weight=True, feature=2))
     agent.observe(torch.zeros(FEATURES))
     agent.receive([])
     assert agent.act().isfinite().all()
@@ -317,16 +317,16 @@ MESSAGES = torch.zeros(3, 2, FEATURES)
 @pytest.mark.parametrize(
     ("links", "arguments", "sentence"),
     [
-        (LinkData(), {"messages": MESSAGES[0]}, r"messages are \[M, 2, 6\], not \[2, 6\]"),
-        (LinkData(), {"messages": MESSAGES[:, :1]}, r"messages are \[M, 2, 6\], not \[3, 1, 6\]"),
-        (LinkData(), {"messages": [MESSAGES[0], MESSAGES[0, :1]]}, r"messages are \[2, 6\] each; one is \[1, 6\]"),
-        (LinkData(), {"messages": MESSAGES, "weight": torch.ones(3)}, "was built without the weight of links"),
-        (LinkData(weight=True), {"messages": MESSAGES}, "needs the weight of links"),
-        (LinkData(weight=True), {"messages": MESSAGES, "weight": [1.0]}, r"weight of links are \[3\], not \[1\]"),
-        (LinkData(feature=2), {"messages": MESSAGES, "feature": torch.ones(3, 1)}, r"are \[3, 2\], not \[3, 1\]"),
+        (EdgeData(), {"messages": MESSAGES[0]}, r"messages are \[M, 2, 6\], not \[2, 6\]"),
+        (EdgeData(), {"messages": MESSAGES[:, :1]}, r"messages are \[M, 2, 6\], not \[3, 1, 6\]"),
+        (EdgeData(), {"messages": [MESSAGES[0], MESSAGES[0, :1]]}, r"messages are \[2, 6\] each; one is \[1, 6\]"),
+        (EdgeData(), {"messages": MESSAGES, "weight": torch.ones(3)}, "was built without the weight of links"),
+        (EdgeData(weight=True), {"messages": MESSAGES}, "needs the weight of links"),
+        (EdgeData(weight=True), {"messages": MESSAGES, "weight": [1.0]}, r"weight of links are \[3\], not \[1\]"),
+        (EdgeData(feature=2), {"messages": MESSAGES, "feature": torch.ones(3, 1)}, r"are \[3, 2\], not \[3, 1\]"),
     ],
 )
-def test_wrong_messages(links: LinkData, arguments: dict[str, Any], sentence: str) -> None:
+def test_wrong_messages(links: EdgeData, arguments: dict[str, Any], sentence: str) -> None:
     agent = Agent(policy(), links)
     agent.observe(torch.zeros(FEATURES))
     with pytest.raises(InputError, match=sentence):

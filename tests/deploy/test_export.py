@@ -26,7 +26,7 @@ from modgnn_rl import Agent, ModGNN, ModGNNLayer, make_model
 from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import DAggerConfig, ExportConfig, ModelConfig, TrainConfig
 from modgnn_rl.deploy import export
-from modgnn_rl.deploy.agent import LinkData
+from modgnn_rl.deploy.agent import EdgeData
 from modgnn_rl.deploy.export import Exported, export_agent
 from modgnn_rl.deploy.onnx_agent import AgentError, OnnxAgent
 from modgnn_rl.errors import InputError
@@ -40,7 +40,7 @@ ROOT = Path(__file__).parents[2]
 NEIGHBOURS = (3, 0, 1, 2, 7, 40, 5)
 FEATURES, WIDTH = 6, 4
 OWN = {("sensors", "battery"): torch.zeros(1)}
-LINKS = LinkData(weight=True, feature=2)
+LINKS = EdgeData(weight=True, feature=2)
 
 
 class _Concatenated(nn.Module):

@@ -17,7 +17,7 @@ from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.nn import aggregation, graph
-from modgnn_rl.nn.aggregation import Hop, aggregate
+from modgnn_rl.nn.aggregation import NodeInputs, aggregate
 from modgnn_rl.nn.communication import Adjacency, GraphAttention, Laplacian
 from modgnn_rl.nn.graph import EdgeList
 from modgnn_rl.nn.topology import Topology
@@ -46,14 +46,14 @@ links = st.builds(
 )
 
 
-def held_by(links: EdgeList, **own: Tensor) -> Hop:
+def held_by(links: EdgeList, **own: Tensor) -> NodeInputs:
     rows = links.num_senders, links.num_receivers
     senders, receivers = (numbers(count, WIDTH).requires_grad_() for count in rows)
-    return Hop(senders, receivers, {("own", name): value for name, value in own.items()})
+    return NodeInputs(senders, receivers, {("own", name): value for name, value in own.items()})
 
 
 def results(
-    links: EdgeList, f_com: nn.Module, f_pre: nn.Module, hop: Hop, kind: str, *, at_once: bool = False
+    links: EdgeList, f_com: nn.Module, f_pre: nn.Module, hop: NodeInputs, kind: str, *, at_once: bool = False
 ) -> list[Tensor]:
     """The aggregate, and gradients for tables and weights; ``at_once`` by plain autograd over all links."""
     value = aggregate(links, f_com, f_pre, hop, kind, (lambda name, rows: None) if at_once else None)
@@ -76,7 +76,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
     def set_size(size: int) -> None:
         monkeypatch.setattr(graph, "BLOCK", {"cpu": size})
-        monkeypatch.setattr(aggregation, "STORED_LINKS", 0)
+        monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", 0)
 
     return set_size
 
@@ -127,7 +127,7 @@ def test_blocks_stored_or_not_are_plain_autograd(
     expected = results(links, f_com, f_pre, hop, kind, at_once=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graph, "BLOCK", {"cpu": size})
-        patch.setattr(aggregation, "STORED_LINKS", 1000 if stored else 0)
+        patch.setattr(aggregation, "MAX_STORED_EDGES", 1000 if stored else 0)
         equal(results(links, f_com, f_pre, hop, kind), expected)
 
 
@@ -141,7 +141,7 @@ def test_frozen_weights_and_constant_data_have_no_gradient(links: EdgeList, size
     expected = results(links, f_com, f_pre, hop, "sum", at_once=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graph, "BLOCK", {"cpu": size})
-        patch.setattr(aggregation, "STORED_LINKS", 0)
+        patch.setattr(aggregation, "MAX_STORED_EDGES", 0)
         equal(results(links, f_com, f_pre, hop, "sum"), expected)
 
 
@@ -157,7 +157,7 @@ def test_the_backward_pass_draws_the_same_dropout(small_blocks: Callable[[int], 
     state = torch.get_rng_state()
     ours = torch.autograd.grad(value.square().sum(), (hop.senders, hop.receivers, *f_pre.parameters()))
     assert torch.equal(torch.get_rng_state(), state)
-    monkeypatch.setattr(aggregation, "STORED_LINKS", 1000)
+    monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", 1000)
     torch.manual_seed(1)
     stored = aggregate(many, Laplacian(), f_pre, hop)
     theirs = torch.autograd.grad(stored.square().sum(), (hop.senders, hop.receivers, *f_pre.parameters()))
@@ -181,8 +181,8 @@ def test_autocast_holds_in_the_backward_pass(
         total = torch.zeros(())
         with torch.autocast("cpu", torch.bfloat16):
             for limit in stored:
-                monkeypatch.setattr(aggregation, "STORED_LINKS", limit)
-                value = aggregate(many, Laplacian(), f_pre, Hop(senders, receivers, {}))
+                monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", limit)
+                value = aggregate(many, Laplacian(), f_pre, NodeInputs(senders, receivers, {}))
                 assert value.dtype == torch.bfloat16
                 total = total + value.float().square().sum()
             if inside:
@@ -220,7 +220,7 @@ class _Pair(nn.Module):
         super().__init__()
         self.f_com, self.f_pre = f_com, f_pre
 
-    def forward(self, links: EdgeList, hop: Hop, record=None) -> Tensor:
+    def forward(self, links: EdgeList, hop: NodeInputs, record=None) -> Tensor:
         return aggregate(links, self.f_com, self.f_pre, hop, record=record)
 
 
@@ -234,7 +234,7 @@ def test_a_module_that_changes_as_it_runs_is_run_again_as_it_was(
     hop = held_by(many)
     small_blocks(5)
     ours = results(many, Laplacian(), f_pre, hop, "sum")
-    monkeypatch.setattr(aggregation, "STORED_LINKS", 1000)
+    monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", 1000)
     equal(ours, results(many, Laplacian(), other, hop, "sum"))
     equal(list(f_pre.buffers()), list(other.buffers()))
 
@@ -277,11 +277,11 @@ def test_learned_weights_and_features_of_links_get_gradients(
     bare = random_links(8, 7, 0.5)
     weight, feature = numbers(len(bare)).requires_grad_(), numbers(len(bare), 2).requires_grad_()
     many = EdgeList(bare.sender, bare.receiver, 8, 7, weight, feature)
-    f_com = TensorDictModule(_Concatenated(), ["sender", ("link", "weight"), ("link", "feature")], ["y"])
+    f_com = TensorDictModule(_Concatenated(), ["sender", ("edge", "weight"), ("edge", "feature")], ["y"])
     hop, f_pre = held_by(many), tanh_network(WIDTH + 3)
     at_once = aggregate(many, f_com, f_pre, hop, record=lambda name, rows: None)
     small_blocks(5)
-    monkeypatch.setattr(aggregation, "STORED_LINKS", limit)
+    monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", limit)
     value = aggregate(many, f_com, f_pre, hop)
     ours, theirs = (
         torch.autograd.grad(total.square().sum(), (weight, feature, *f_pre.parameters())) for total in (value, at_once)
@@ -294,7 +294,7 @@ class _Concatenated(nn.Module):
         return torch.cat(parts, -1)
 
 
-@pytest.mark.parametrize("form", ["links", "pairs"])
+@pytest.mark.parametrize("form", ["edges", "dense"])
 @pytest.mark.parametrize("kind", graph.AGGREGATIONS)
 @few
 @given(share=st.sampled_from([0.0, 0.4, 1.0]), seed=seeds)
@@ -334,7 +334,7 @@ def statistics() -> nn.BatchNorm1d:
     return nn.BatchNorm1d(WIDTH, momentum=1.0)
 
 
-@pytest.mark.parametrize("form", ["auto", "links"])
+@pytest.mark.parametrize("form", ["auto", "edges"])
 @few
 @given(share=st.sampled_from([0.3, 0.9]), seed=seeds)
 def test_batch_statistics_are_those_of_real_links_and_agents(form: str, share: float, seed: int) -> None:
@@ -346,10 +346,10 @@ def test_batch_statistics_are_those_of_real_links_and_agents(form: str, share: f
     observation = 5 + numbers(flocks, steps, agents, WIDTH)
     adjacency = (torch.rand(flocks, steps, agents, agents) < share) | torch.eye(agents).bool()
     exists = torch.ones(flocks, steps, agents, dtype=torch.bool)
-    if form == "links":
+    if form == "edges":
         exists[0, :, 2:], observation[0, :, 2:] = False, 1e6
     data = TensorDict({"agents": {"observation": observation}, "adjacency": adjacency}, [flocks, steps])
-    if form == "links":
+    if form == "edges":
         data["agents", "mask"] = exists
     rows: dict[nn.Module, int] = {}
     for module in layer.submodules:

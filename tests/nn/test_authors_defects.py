@@ -69,7 +69,7 @@ def test_messages_are_received_over_the_links_of_now() -> None:
 def test_the_weight_of_a_link_counts_once() -> None:
     """They multiply by the edge weights in f_com, and again when they sum over the neighbours."""
     observation, weight = torch.randn(2, AGENTS, FEATURES), torch.rand(2, AGENTS, AGENTS)
-    for form in ("links", "pairs"):
+    for form in ("edges", "dense"):
         policy = ModGNN(ModGNNLayer(1, f_com=Adjacency()), form=form)
         data = TensorDict({"agents": {"observation": observation}, "adjacency": weight}, [2])
         torch.testing.assert_close(run(policy, data)[1], observation[1] + weight[1] @ observation[0])
@@ -80,7 +80,7 @@ def test_nan_does_not_leak_through_the_mask() -> None:
     data = random_data(STEPS)
     data["adjacency"][:, 1:, 0] = False
     data["agents", "observation"][:, 0] = torch.nan
-    for form in ("links", "pairs"):
+    for form in ("edges", "dense"):
         policy = make_policy(2, 1)
         policy.form = form
         action = run(policy, data)[:, 1:]

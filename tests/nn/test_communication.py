@@ -26,7 +26,7 @@ from modgnn_rl.nn.topology import Topology
 
 seeds = st.integers(0, 999)
 shares = st.sampled_from([0.0, 0.4, 1.0])
-forms = st.sampled_from(["links", "pairs"])
+forms = st.sampled_from(["edges", "dense"])
 few = settings(max_examples=15)
 STEPS, AGENTS = 5, 4
 
@@ -41,10 +41,10 @@ def random_mask(*shape: int, agents: int = AGENTS, share: float = 0.5) -> Tensor
 
 def on_links(f_com: Communication, held: Tensor, mask: Tensor, form: str, **of_links: Tensor | None) -> Tensor:
     """Y of all pairs [G, N, N, D'], zero where there is no link, from what the agents hold [G, N, D]."""
-    topology = Topology(mask, AGENTS, **of_links, form=form, keep_positions=True)
+    topology = Topology(mask, AGENTS, **of_links, form=form)
     everyone, table = topology.all_edges(), held.flatten(0, 1)
     y = f_com(everyone.gather_senders(table), everyone.gather_receivers(table), everyone)
-    return topology.spread_links(y, everyone)
+    return topology.to_input_layout(y, everyone)
 
 
 def every_link(mask: Tensor) -> list[list[int]]:
@@ -157,7 +157,7 @@ def test_attention_to_differences_does_not_feel_a_translation(seed: int, form: s
 
 
 def test_heads_share_the_width() -> None:
-    with pytest.raises(InputError, match="out_features=5 is no multiple of heads=2; each head has its share"):
+    with pytest.raises(InputError, match="out_features=5 is not a multiple of heads=2"):
         GraphAttention(3, 5, 2)
 
 
@@ -312,7 +312,7 @@ def test_what_is_no_link_spoils_no_gradient(share: float, seed: int) -> None:
     f_pre = [None, nn.Sequential(_Logarithm(), nn.Linear(3, 3))]
     layer = ModGNNLayer(1, nn.Linear(3, 3), _Direction(), f_pre).double()
     observation = numbers(3, AGENTS, 3).requires_grad_()
-    for form in ("links", "pairs"):
+    for form in ("edges", "dense"):
         output, _ = layer(observation, Topology(mask, AGENTS, form=form))
         results.append([output, *torch.autograd.grad(output.square().sum(), (observation, *layer.parameters()))])
         assert all(value.isfinite().all() for value in results[-1])
@@ -368,7 +368,7 @@ def test_links_and_pairs_are_one(name: str, share: float, seed: int) -> None:
     mask, observation = random_mask(STEPS, share=share), numbers(STEPS, AGENTS, 3).requires_grad_()
     weight, feature = torch.rand(mask.shape).double().requires_grad_(), numbers(*mask.shape, 2).requires_grad_()
     results = []
-    for form in ("links", "pairs"):
+    for form in ("edges", "dense"):
         output, sent = layer(observation, Topology(mask, AGENTS, weight=weight, feature=feature, form=form))
         wanted = (observation, weight, feature, *layer.parameters())
         total = output.square().sum() + sent.nan_to_num().square().sum()

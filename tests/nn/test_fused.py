@@ -14,7 +14,7 @@ from torch.nn.utils import parametrizations
 
 from modgnn_rl import ModGNNLayer
 from modgnn_rl.nn import fused, graph
-from modgnn_rl.nn.aggregation import Hop, aggregate
+from modgnn_rl.nn.aggregation import NodeInputs, aggregate
 from modgnn_rl.nn.communication import Adjacency, Laplacian
 from modgnn_rl.nn.graph import EdgeList
 from modgnn_rl.nn.topology import Topology
@@ -43,14 +43,14 @@ links = st.builds(
 )
 
 
-def held_by(links: EdgeList, **own: Tensor) -> Hop:
+def held_by(links: EdgeList, **own: Tensor) -> NodeInputs:
     rows = links.num_senders, links.num_receivers
     senders, receivers = (numbers(count, WIDTH).requires_grad_() for count in rows)
-    return Hop(senders, receivers, {("own", name): value for name, value in own.items()})
+    return NodeInputs(senders, receivers, {("own", name): value for name, value in own.items()})
 
 
 def results(
-    links: EdgeList, f_com: nn.Module, f_pre: nn.Module, hop: Hop, kind: str, *, at_once: bool = False
+    links: EdgeList, f_com: nn.Module, f_pre: nn.Module, hop: NodeInputs, kind: str, *, at_once: bool = False
 ) -> list[Tensor]:
     """The aggregate, and gradients for tables and weights; ``at_once`` by plain autograd over all links."""
     value = aggregate(links, f_com, f_pre, hop, kind, (lambda name, rows: None) if at_once else None)
@@ -119,7 +119,7 @@ networks = st.builds(
 def test_rewrites_are_exact(f_com: nn.Module, kind: str, f_pre: nn.Module, links: EdgeList, size: int) -> None:
     hop = held_by(links)
     expected = results(links, f_com, f_pre, hop, kind, at_once=True)
-    assert fused.rewrite(links, f_com, f_pre) is not None
+    assert fused.fuse(links, f_com, f_pre) is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graph, "BLOCK", {"cpu": size})
         equal(results(links, f_com, f_pre, hop, kind), expected)
@@ -133,9 +133,9 @@ def test_gradients_of_a_rewrite_by_finite_differences(f_com: nn.Module, small_bl
     hop = held_by(many)
 
     def value(senders: Tensor, receivers: Tensor, *weights: Tensor) -> Tensor:
-        return aggregate(many, f_com, f_pre, Hop(senders, receivers, {}))
+        return aggregate(many, f_com, f_pre, NodeInputs(senders, receivers, {}))
 
-    assert fused.rewrite(many, f_com, f_pre) is not None
+    assert fused.fuse(many, f_com, f_pre) is not None
     inputs = (hop.senders, hop.receivers, *f_pre.parameters())
     assert torch.autograd.gradcheck(value, inputs, check_undefined_grad=False)
 
@@ -181,7 +181,7 @@ def test_other_modules_are_not_rewritten(name: str, small_blocks: Callable[[int]
     torch.manual_seed(0)
     f_com, f_pre = (module.double() for module in OTHERS[name]())
     many = random_links(6, 5, 0.5)
-    assert fused.rewrite(many, f_com, f_pre) is None
+    assert fused.fuse(many, f_com, f_pre) is None
     hop = held_by(many)
     expected = results(many, f_com, f_pre, hop, "sum", at_once=True)
     small_blocks(5)
@@ -192,10 +192,10 @@ def test_weighted_links_and_autocast_are_not_rewritten() -> None:
     bare = random_links(6, 5, 0.5)
     f_pre = nn.Sequential(nn.Linear(WIDTH, 4), nn.ReLU(), nn.Linear(4, 2))
     weighted = EdgeList(bare.sender, bare.receiver, 6, 5, torch.ones(len(bare)))
-    assert fused.rewrite(bare, Laplacian(), f_pre) is not None
-    assert fused.rewrite(weighted, Laplacian(), f_pre) is None
+    assert fused.fuse(bare, Laplacian(), f_pre) is not None
+    assert fused.fuse(weighted, Laplacian(), f_pre) is None
     with torch.autocast("cpu", torch.bfloat16):
-        assert fused.rewrite(bare, Laplacian(), f_pre) is None
+        assert fused.fuse(bare, Laplacian(), f_pre) is None
 
 
 def test_a_rewritten_policy_acts_and_learns_as_one_with_a_hook() -> None:

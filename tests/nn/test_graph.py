@@ -121,7 +121,7 @@ def test_softmax_and_its_gradient(mask: Tensor, offset: float, rubbish: float) -
     (gradient,) = torch.autograd.grad((expected * weights).sum(), logits)
     pairs = DenseGraph(mask)
     everywhere = in_pairs(logits, mask, rubbish)
-    of_pairs = pairs.only_linked(pairs.softmax(everywhere))[mask.flatten()]
+    of_pairs = pairs.fill_non_edges(pairs.softmax(everywhere))[mask.flatten()]
     for found in (links_of(mask).softmax(logits), of_pairs):
         torch.testing.assert_close(found, expected)
         (ours,) = torch.autograd.grad((found * weights).sum(), logits)
@@ -137,10 +137,10 @@ def test_links_between_some(mask: Tensor, seed: int, share: float) -> None:
     weight, feature = numbers(*mask.shape), numbers(*mask.shape, 2)
     kept = mask & of_senders.unsqueeze(1) & of_receivers.unsqueeze(2)
     expected = links_of(kept, weight=weight, feature=feature)
-    links = links_of(mask, weight=weight, feature=feature).between(of_senders.flatten(), of_receivers.flatten())
+    links = links_of(mask, weight=weight, feature=feature).subgraph(of_senders.flatten(), of_receivers.flatten())
     assert torch.equal(links.sender, expected.sender)
     assert torch.equal(links.receiver, expected.receiver)
-    pairs = DenseGraph(mask, weight, feature).between(of_senders.flatten(), of_receivers.flatten())
+    pairs = DenseGraph(mask, weight, feature).subgraph(of_senders.flatten(), of_receivers.flatten())
     assert torch.equal(pairs.mask, kept)
     assert (links.num_senders, links.num_receivers) == (pairs.num_senders, pairs.num_receivers)
     for name in ("weight", "feature"):
@@ -267,7 +267,7 @@ def test_a_floating_point_adjacency_holds_the_weights(share: float, seed: int, f
     observation = numbers(3, 4, 2).requires_grad_()
     layer = ModGNNLayer(2, f_mid=[nn.Linear(2, 2) for _ in range(3)]).double()
     found = outputs_and_gradients(layer, observation, Topology(weight, 4, form=form), weight)
-    separate = Topology(mask, 4, weight=weight, form="links")
+    separate = Topology(mask, 4, weight=weight, form="edges")
     torch.testing.assert_close(found, outputs_and_gradients(layer, observation, separate, weight), equal_nan=True)
     ones = outputs_and_gradients(layer, observation, Topology(mask.double(), 4, form=form))
     torch.testing.assert_close(ones, outputs_and_gradients(layer, observation, Topology(mask, 4)), equal_nan=True)
@@ -276,13 +276,13 @@ def test_a_floating_point_adjacency_holds_the_weights(share: float, seed: int, f
 def test_few_agents_most_of_which_are_linked_are_worked_on_in_pairs() -> None:
     most, some = torch.ones(2, 4, 4, dtype=torch.bool), torch.eye(4, dtype=torch.bool).expand(2, -1, -1)
     everyone = torch.ones(2, 4, dtype=torch.bool)
-    assert Topology(most, 4).as_pairs
-    assert not Topology(some, 4).as_pairs
-    assert not Topology(most, 4, mask=everyone).as_pairs
-    assert not Topology(most, 4, receivers=everyone).as_pairs
-    assert not Topology(torch.ones(1, 65, 65, dtype=torch.bool), 65).as_pairs
-    assert not Topology(most, 4, form="links").as_pairs
-    assert Topology(some, 4, form="pairs").as_pairs
+    assert Topology(most, 4).is_dense
+    assert not Topology(some, 4).is_dense
+    assert not Topology(most, 4, mask=everyone).is_dense
+    assert not Topology(most, 4, receivers=everyone).is_dense
+    assert not Topology(torch.ones(1, 65, 65, dtype=torch.bool), 65).is_dense
+    assert not Topology(most, 4, form="edges").is_dense
+    assert Topology(some, 4, form="dense").is_dense
 
 
 @pytest.mark.parametrize("form", topology.FORMS)
@@ -293,12 +293,12 @@ def test_few_agents_most_of_which_are_linked_are_worked_on_in_pairs() -> None:
         (torch.ones(4, dtype=torch.bool), {}, r"must be \[..., 4, 4\], not \(4,\)"),
         (torch.ones(2, 4, 4, dtype=torch.int64), {}, r"edge list \[..., 2, E\].*has shape \(2, 4, 4\); .* as bool"),
         (torch.ones(2, dtype=torch.int64), {}, r"edge list \[..., 2, E\].*has shape \(2,\)"),
-        (torch.tensor([[[0, 4], [1, 1]]]), {}, r"of 4 agents names agent 4 or 0; expected numbers from 0 to 3"),
-        (torch.tensor([[[0, 3], [1, 4]]]), {}, r"of 4 agents names agent 4 or 0; expected numbers from 0 to 3"),
-        (torch.tensor([[[0, -2], [1, -2]]]), {}, r"names agent 1 or -2; .* and -1 for both ends"),
-        (torch.tensor([[[0, -1], [1, 3]]]), {}, r"names agent 3 or -1; .* and -1 for both ends"),
-        (torch.ones(2, 4, 4, dtype=torch.bool), {"weight": torch.ones(2, 4)}, "8 weights for 32 places of links"),
-        (torch.tensor([[[0, 1], [1, 3]]]), {"feature": torch.ones(1, 3, 5)}, "3 features for 2 places of links"),
+        (torch.tensor([[[0, 4], [1, 1]]]), {}, r"of 4 agents contains numbers from 0 to 4; expected agents 0 to 3"),
+        (torch.tensor([[[0, 3], [1, 4]]]), {}, r"of 4 agents contains numbers from 0 to 4; expected agents 0 to 3"),
+        (torch.tensor([[[0, -2], [1, -2]]]), {}, r"numbers from -2 to 1; .* or -1 for both ends"),
+        (torch.tensor([[[0, -1], [1, 3]]]), {}, r"numbers from -1 to 3; .* or -1 for both ends"),
+        (torch.ones(2, 4, 4, dtype=torch.bool), {"weight": torch.ones(2, 4)}, "8 edge weights for 32 entries"),
+        (torch.tensor([[[0, 1], [1, 3]]]), {"feature": torch.ones(1, 3, 5)}, "3 edge features for 2 entries"),
     ],
 )
 def test_what_is_no_graph_is_refused(form: str, adjacency: Tensor, of_links: dict[str, Any], sentence: str) -> None:
@@ -307,7 +307,7 @@ def test_what_is_no_graph_is_refused(form: str, adjacency: Tensor, of_links: dic
 
 
 def test_an_unknown_form_is_refused() -> None:
-    with pytest.raises(InputError, match="form='sparse' is not one of auto, links, pairs"):
+    with pytest.raises(InputError, match="form='sparse' is not one of auto, edges, dense"):
         ModGNN(ModGNNLayer(1), form="sparse")
 
 
@@ -330,13 +330,13 @@ def test_no_links_no_agents_and_no_flocks(form: str) -> None:
 @pytest.mark.parametrize("form", topology.FORMS)
 def test_a_graph_for_other_data_is_refused(form: str) -> None:
     adjacency, layer = torch.ones(3, 3, dtype=torch.bool), ModGNNLayer(1)
-    with pytest.raises(InputError, match=r"1 graphs for observations \[4, 3\] of flocks; each needs its own"):
+    with pytest.raises(InputError, match=r"1 graphs for observations \[4, 3\] .*; each step of each flock needs one"):
         layer(numbers(4, 3, 2), Topology(adjacency, 3, form=form))
 
 
 def test_the_form_says_what_kind_of_graph_an_f_com_sees() -> None:
     adjacency = torch.ones(1, 2, 2, dtype=torch.bool)
-    for form, kind in (("links", EdgeList), ("pairs", DenseGraph)):
+    for form, kind in (("edges", EdgeList), ("dense", DenseGraph)):
         everyone = Topology(adjacency, 2, form=form).all_edges()
         assert isinstance(everyone, kind)
         assert everyone.weight is None

@@ -100,7 +100,7 @@ def all_by_hand(policy: ModGNN, data: TensorDict) -> dict[tuple[str, ...], Tenso
 
 @settings(max_examples=20)
 @given(
-    form=st.sampled_from(["auto", "links", "pairs"]),
+    form=st.sampled_from(["auto", "edges", "dense"]),
     batch=st.lists(st.integers(1, 2), max_size=2),
     masked=st.booleans(),
     some=st.booleans(),

@@ -69,14 +69,14 @@ def run(policy: nn.Module, data: TensorDict, *receivers: Tensor) -> TensorDict:
 
 def test_a_keyed_f_com_reads_both_ends_the_receivers_data_and_the_link() -> None:
     keys = ["sender", "receiver", ("own", "observation"), ("own", "goal"), "input"]
-    keys += [("link", "weight"), ("link", "feature")]
+    keys += [("edge", "weight"), ("edge", "feature")]
     network = _Concatenated(FEATURES * 4 + 1 + 1 + 3, 2)
     f_com = TensorDictModule(network, keys, ["y"])
     layer = ModGNNLayer(1, f_com=f_com)
     data = random_window(3, STEPS)
     results = []
-    for form in ("links", "pairs"):
-        policy = ModGNN(layer, link_weight="weight", link_feature="feature", form=form).double()
+    for form in ("edges", "dense"):
+        policy = ModGNN(layer, edge_weight="weight", edge_feature="feature", form=form).double()
         results.append(run(policy, data)[ACTION])
     observation, goal = data["agents", "observation"], data["agents", "goal"]
     expected = observation.clone()
@@ -90,14 +90,14 @@ def test_a_keyed_f_com_reads_both_ends_the_receivers_data_and_the_link() -> None
         torch.testing.assert_close(result, expected)
 
 
-@pytest.mark.parametrize("form", ["links", "pairs"])
+@pytest.mark.parametrize("form", ["edges", "dense"])
 def test_a_keyed_f_pre_reads_the_link_and_its_layers_input(form: str) -> None:
     """In a second layer that is the observation and the first one's output."""
     first = ModGNNLayer(1, f_final=dense(FEATURES, 3))
-    keys = ["data", "input", ("own", "goal"), ("link", "weight")]
+    keys = ["data", "input", ("own", "goal"), ("edge", "weight")]
     network = _Concatenated((FEATURES + 3) * 2 + 1 + 1, 2)
     second = ModGNNLayer(1, f_pre=[dense(FEATURES + 3, 2), TensorDictModule(network, keys, ["out"])])
-    policy = ModGNN([first, second], link_weight="weight", form=form).double()
+    policy = ModGNN([first, second], edge_weight="weight", form=form).double()
     data = random_window(STEPS)
     # f_pre of hop 0 is plain here: there is no link.
     observation, goal = data["agents", "observation"], data["agents", "goal"]
@@ -145,7 +145,7 @@ def test_own_data_are_found_where_the_policy_is_told() -> None:
 )
 def test_data_that_are_missing_are_named(missing: str | tuple[str, ...], sentence: str) -> None:
     f_final = TensorDictModule(torch.mul, ["data", ("own", "goal")], ["out"])
-    policy = ModGNN(ModGNNLayer(1, f_final=f_final), link_weight="weight", link_feature="feature").double()
+    policy = ModGNN(ModGNNLayer(1, f_final=f_final), edge_weight="weight", edge_feature="feature").double()
     data = random_window(STEPS)
     del data[missing]
     with pytest.raises(InputError, match=sentence):
@@ -154,8 +154,8 @@ def test_data_that_are_missing_are_named(missing: str | tuple[str, ...], sentenc
 
 @pytest.mark.parametrize("name", ["weight", "feature"])
 def test_a_submodule_cannot_read_what_links_do_not_have(name: str) -> None:
-    f_com = TensorDictModule(_Concatenated(FEATURES + 1, 2), ["sender", ("link", name)], ["y"])
-    with pytest.raises(InputError, match=rf"reads \('link', '{name}'\), and the links have no {name}; see link_{name}"):
+    f_com = TensorDictModule(_Concatenated(FEATURES + 1, 2), ["sender", ("edge", name)], ["y"])
+    with pytest.raises(InputError, match=rf"reads \('edge', '{name}'\), but the edges have no {name}; see edge_{name}"):
         run(ModGNN(ModGNNLayer(1, f_com=f_com)).double(), random_window(STEPS))
 
 
@@ -171,14 +171,14 @@ def test_a_submodule_cannot_read_what_links_do_not_have(name: str) -> None:
 )
 def test_data_of_another_shape_are_refused(key: str, shape: tuple[int, ...], sentence: str) -> None:
     f_final = TensorDictModule(torch.mul, ["data", ("own", "goal")], ["out"])
-    policy = ModGNN(ModGNNLayer(1, f_final=f_final), link_weight="weight").double()
+    policy = ModGNN(ModGNNLayer(1, f_final=f_final), edge_weight="weight").double()
     data = TensorDict(random_window(STEPS).to_dict(), [])
     data[key] = torch.ones(shape, dtype=torch.bool if key in ("adjacency", "is_init") else torch.float64)
     with pytest.raises(InputError, match=sentence):
         run(policy, data)
 
 
-@pytest.mark.parametrize("form", ["links", "pairs"])
+@pytest.mark.parametrize("form", ["edges", "dense"])
 def test_own_data_may_be_whole_numbers_and_flags(form: str) -> None:
     """Also of an agent that sees nothing, whose data are set to zero."""
 
@@ -319,7 +319,7 @@ def test_an_f_com_of_its_own_for_each_hop() -> None:
         before = held.roll(1, 0)
         ends = before.unsqueeze(1).expand(-1, AGENTS, -1, -1), before.unsqueeze(2).expand(-1, -1, AGENTS, -1)
         if hop == 2:  # attention, see its own tests
-            topology = Topology(data["adjacency"], AGENTS, form="pairs")
+            topology = Topology(data["adjacency"], AGENTS, form="dense")
             y = f_com[1](*(end.flatten(0, 2) for end in ends), topology.all_edges()).view(6, AGENTS, AGENTS, -1)
         else:
             y = f_com[hop - 1](*(end.contiguous() for end in ends))

@@ -46,7 +46,7 @@ def make_layer(hops: int, start: str = "mask", inputs: int = FEATURES, kind: str
 
 def make_policy(hops: list[int], start: str, kind: str, form: str) -> ModGNN:
     layers = [make_layer(k, start, FEATURES + 2 * number, kind) for number, k in enumerate(hops)]
-    keys: dict[str, Any] = {"link_weight": "weight", "link_feature": "feature"} if kind == "links" else {}
+    keys: dict[str, Any] = {"edge_weight": "weight", "edge_feature": "feature"} if kind == "links" else {}
     policy = ModGNN(layers, **keys, form=form).double()
     with torch.no_grad():
         for parameter in policy.parameters():
@@ -207,7 +207,7 @@ def test_agents_that_fail_come_back_with_nothing(hops: int, agents: int, form: s
 
 
 @pytest.mark.parametrize("start", STARTS)
-@pytest.mark.parametrize("form", ["links", "pairs"])
+@pytest.mark.parametrize("form", ["edges", "dense"])
 @torch.no_grad()
 def test_steps_make_the_window_while_agents_come_and_go(start: str, form: str) -> None:
     torch.manual_seed(0)
@@ -279,7 +279,7 @@ class _Logarithm(nn.Module):
 
 
 @pytest.mark.parametrize("start", STARTS)
-@pytest.mark.parametrize("form", ["links", "pairs"])
+@pytest.mark.parametrize("form", ["edges", "dense"])
 @torch.no_grad()
 def test_data_that_f_input_turns_into_no_numbers_are_not_sent(start: str, form: str) -> None:
     """In a window as in single steps, where a message that is not finite is one not held."""

@@ -188,7 +188,7 @@ def test_every_key_of_the_memory_may_be_renamed() -> None:
 def test_a_policy_that_cannot_run_on_what_the_environment_emits_is_refused() -> None:
     policy = make_model("modgnn_mlp", adjacency="graph")
     env = TransformedEnv(flocking(), InitTracker())
-    with pytest.raises(InputError, match=r"'graph' is missing .* by a transform that is appended before"):
+    with pytest.raises(InputError, match=r"'graph' is missing .* must be appended before the policy"):
         env.append_transform(policy.make_tensordict_primer()).reset()
 
 

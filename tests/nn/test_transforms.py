@@ -25,7 +25,7 @@ from modgnn_rl.nn.communication import GraphAttention, MessagePassing
 
 FEATURES, AGENTS, STEPS = 2, 4, 4
 ACTION = ("agents", "action")
-FORMS = pytest.mark.parametrize("form", ["links", "pairs"])
+FORMS = pytest.mark.parametrize("form", ["edges", "dense"])
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +61,7 @@ def relu_layer(hops: int, inputs: int = FEATURES) -> ModGNNLayer:
 
 def make_policy(*layers: Callable[..., ModGNNLayer], hops: int = 1, form: str = "auto") -> ModGNN:
     built = [make(hops, FEATURES * (number + 1)) for number, make in enumerate(layers)]
-    return ModGNN(built, link_weight="weight", link_feature="feature", form=form).double()
+    return ModGNN(built, edge_weight="weight", edge_feature="feature", form=form).double()
 
 
 def random_window(*batch: int) -> TensorDict:
@@ -202,7 +202,7 @@ def test_gradients_of_a_policy_by_finite_differences(
     form: str, layers: tuple[Callable[..., ModGNNLayer], ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(graph, "BLOCK", {"cpu": 3})
-    monkeypatch.setattr(aggregation, "STORED_LINKS", 0)
+    monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", 0)
     policy, data = make_policy(*layers, form=form), random_window(1, 3)
     links = (data["weight"], data["feature"]) if layers[0] is message_layer else ()
     inputs = [data["agents", "observation"], *links]
@@ -219,7 +219,7 @@ def test_gradients_of_a_policy_by_finite_differences(
 
 @FORMS
 def test_a_checkpointed_policy_has_the_same_gradients(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(aggregation, "STORED_LINKS", 0)
+    monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", 0)
     policy, data = make_policy(message_layer, relu_layer, form=form), random_window(2, STEPS)
     results = []
     for action in (run(policy, data), checkpoint(run, policy, data, use_reentrant=False)):
@@ -235,7 +235,7 @@ def test_a_checkpointed_policy_has_the_same_gradients(form: str, monkeypatch: py
 def test_autocast_stays_close_and_keeps_the_messages_as_they_are(
     form: str, stored: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(aggregation, "STORED_LINKS", stored)
+    monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", stored)
     policy, data = make_policy(message_layer, relu_layer, hops=2, form=form).float(), random_window(3, STEPS).float()
     data["adjacency"], data["is_init"] = data["adjacency"].bool(), data["is_init"].bool()
     data["agents", "mask"] = data["agents", "mask"].bool()
@@ -326,7 +326,7 @@ def test_steps_make_the_window_and_memory_is_finite(form: str, start: str, seed:
     """Two layers with K = 2 and 1, weights, features, own data, a mask, and resets of some flocks in mid-window."""
     torch.manual_seed(seed)
     policy = ModGNN(
-        [message_layer(2), attention_layer(1, 2 * FEATURES)], link_weight="weight", link_feature="feature", form=form
+        [message_layer(2), attention_layer(1, 2 * FEATURES)], edge_weight="weight", edge_feature="feature", form=form
     ).double()
     for layer in policy.layers:
         layer.start = start

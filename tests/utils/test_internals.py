@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
+import torch
+from torch import Tensor, nn
 
 from modgnn_rl.envs.parallel import parallel_flocks
-from modgnn_rl.utils.internals import parallel_env_processes, parse_hydra_flags
+from modgnn_rl.utils.internals import has_hooks, is_functorch_active, parallel_env_processes, parse_hydra_flags
 
 
 def test_hydra_flags_have_the_fields_that_the_command_line_reads() -> None:
@@ -30,3 +34,40 @@ def test_processes_of_a_parallel_env_are_listed_by_worker_index() -> None:
     assert [process.is_alive() for process in processes] == [True, True]
     env.close()
     assert [process.is_alive() for process in processes] == [False, False]
+
+
+def _ignore(*_: object) -> None:
+    return None
+
+
+@pytest.mark.parametrize(
+    "register",
+    [
+        nn.Module.register_forward_hook,
+        nn.Module.register_forward_pre_hook,
+        nn.Module.register_full_backward_hook,
+        nn.Module.register_full_backward_pre_hook,
+    ],
+)
+def test_hooks_of_every_kind_are_seen(register: Callable[..., torch.utils.hooks.RemovableHandle]) -> None:
+    """Else: `modgnn_rl.nn.fused` skips the hooks of a layer."""
+    module = nn.Linear(2, 2)
+    assert not has_hooks(module)
+    handle = register(module, _ignore)
+    assert has_hooks(module)
+    handle.remove()
+    assert not has_hooks(module)
+
+
+def test_a_running_transform_of_torch_func_is_seen() -> None:
+    """Else: shapes depend on data under ``vmap``, which fails there."""
+    seen: list[bool] = []
+
+    def function(x: Tensor) -> Tensor:
+        seen.append(is_functorch_active())
+        return x.square().sum()
+
+    function(torch.ones(3))
+    torch.func.vmap(function)(torch.ones(2, 3))
+    torch.func.grad(function)(torch.ones(3))
+    assert seen == [False, True, True]

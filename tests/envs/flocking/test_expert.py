@@ -199,7 +199,7 @@ def test_lists_of_links_are_the_matrix(seed: int, agents: int) -> None:
 
 def test_links_of_agents_that_do_not_exist_are_refused() -> None:
     links = torch.tensor([[[0, 3], [1, 0]]])
-    with pytest.raises(InputError, match="names agent 3"):
+    with pytest.raises(InputError, match="numbers from 0 to 3"):
         reynolds(*flock(0, 1, 3), **GAINS, max_speed=0.92, visible=links)
 
 
