@@ -28,22 +28,22 @@ def main(config: ReproduceConfig) -> int:
         )
     recordable(config.env, config.scale.steps)
     folder = claim_folder(config)
-    from modgnn_rl.reproduction.measurements import Measurements
+    from modgnn_rl.reproduction.jobs import run_jobs
+    from modgnn_rl.reproduction.measurements import Results
     from modgnn_rl.reproduction.pages import write_study
-    from modgnn_rl.reproduction.pipeline import cells_of
+    from modgnn_rl.reproduction.pipeline import jobs_of
     from modgnn_rl.reproduction.studies import study_of
-    from modgnn_rl.reproduction.tasks import run_cells
     from modgnn_rl.utils.device import prepare_torch
 
     prepare_torch(config.device, config.threads)
     study = study_of(config)
     started = datetime.now().astimezone()
     try:
-        outcome = run_cells(folder / "cells", cells_of(config, study, folder))
+        outcome = run_jobs(folder / "jobs", jobs_of(config, study, folder))
     except KeyboardInterrupt:
         print(f"Stopped; finished jobs are kept in {folder}, and the same command resumes there", file=sys.stderr)
         raise
-    page = write_study(Measurements(outcome, config, study), folder, started)
+    page = write_study(Results(outcome, config, study), folder, started)
     print(f"The tables are in {page.with_name('tables.md')}, the report is {page}")
     for line in outcome.failure_lines():
         print(f"failed: {line}", file=sys.stderr)

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from modgnn_rl.evaluation.statistics import Interval, probability_of_improvement
 from modgnn_rl.reporting.table import Table
-from modgnn_rl.reproduction.measurements import VALIDATION, Measurements
+from modgnn_rl.reproduction.measurements import VALIDATION, Results
 from modgnn_rl.reproduction.paper_tables import NAMES, mean, published, shown, spread
-from modgnn_rl.reproduction.studies import HOPS, Subject
+from modgnn_rl.reproduction.studies import HOPS, ModelVariant
 
-__all__ = ["CLAIMS", "Claim", "Side", "claim_tables", "judge"]
+__all__ = ["CLAIMS", "Claim", "Operand", "claim_tables", "judge"]
 
 WITH_PRE, WITHOUT_PRE, BASELINES = ("modgnn_mlp", "no_mid"), ("no_pre", "gcn_final"), ("gcn", "gcn_final")
 OTHERS = ("no_mid", "no_pre", "gcn", "gcn_final")
@@ -28,7 +28,7 @@ FIGURES = {
 
 
 @dataclass(frozen=True)
-class Side:
+class Operand:
     """One side of a comparison: a model's figure in a world, averaged over its hops where there are several."""
 
     model: str
@@ -43,10 +43,10 @@ class Side:
         agents = f", N = {self.env_config[1:]}" if self.env_config != VALIDATION else ""
         return f"{NAMES[self.model]}{hops}{agents}"
 
-    def values(self, measurements: Measurements) -> NDArray[np.float64] | None:
+    def values(self, results: Results) -> NDArray[np.float64] | None:
         """The figure of all rollouts [S, F]; None where something of it failed or was not flown."""
         hops = (1,) if self.model == "central" else self.hops
-        found = [measurements.values(Subject(self.model, hop), self.env_config, self.figure) for hop in hops]
+        found = [results.values(ModelVariant(self.model, hop), self.env_config, self.figure) for hop in hops]
         known = [values for values in found if values is not None]
         same = len(known) == len(found) and len({values.shape for values in known}) == 1
         return np.mean(known, axis=0) if same else None
@@ -57,21 +57,21 @@ class Claim:
     """An ordering, as comparisons of which each first side should have the lower figure."""
 
     text: str
-    comparisons: tuple[tuple[Side, Side], ...]
+    comparisons: tuple[tuple[Operand, Operand], ...]
 
 
 def _levels() -> Claim:
     levels = (WITH_PRE, WITHOUT_PRE, ("gcn",), ("central",))
     pairs = [pair for low, high in itertools.pairwise(levels) for pair in itertools.product(low, high)]
     # The paper leaves out its GCN with K = 3 here, as an outlier.
-    sides = {model: Side(model, HOPS[:2] if model == "gcn" else HOPS) for pair in pairs for model in pair}
+    sides = {model: Operand(model, HOPS[:2] if model == "gcn" else HOPS) for pair in pairs for model in pair}
     text = "Validation error has four levels: models with f_pre; with networks elsewhere; GCN (K = 1, 2); Central"
     return Claim(text, tuple((sides[better], sides[worse]) for better, worse in pairs))
 
 
 def _best(text: str, figure: str, env_config: str, others: Sequence[str], hops: Sequence[int] = HOPS) -> Claim:
     pairs = [
-        (Side("modgnn_mlp", (hop,), env_config, figure), Side(other, (hop,), env_config, figure))
+        (Operand("modgnn_mlp", (hop,), env_config, figure), Operand(other, (hop,), env_config, figure))
         for hop in hops
         for other in others
     ]
@@ -80,20 +80,20 @@ def _best(text: str, figure: str, env_config: str, others: Sequence[str], hops: 
 
 def _more_hops() -> Claim:
     pairs = [
-        (Side("modgnn_mlp", (more,), "N32"), Side("modgnn_mlp", (fewer,), "N32"))
+        (Operand("modgnn_mlp", (more,), "N32"), Operand("modgnn_mlp", (fewer,), "N32"))
         for fewer, more in itertools.pairwise(HOPS)
     ]
     return Claim("ModGNN-MLP gains with K on its own rollouts", tuple(pairs))
 
 
 def _no_gain() -> Claim:
-    pairs = [(Side(model, (2,), "N32"), Side(model, (3,), "N32")) for model in BASELINES]
+    pairs = [(Operand(model, (2,), "N32"), Operand(model, (3,), "N32")) for model in BASELINES]
     return Claim("The baselines do not gain with K: K = 3 is worse than K = 2 on their own rollouts", tuple(pairs))
 
 
 def _abroad() -> Claim:
     pairs = [
-        (Side("modgnn_mlp", (hop,), env_config), Side(model, (hop,), "N32"))
+        (Operand("modgnn_mlp", (hop,), env_config), Operand(model, (hop,), "N32"))
         for hop in HOPS
         for env_config in ("N16", "N64")
         for model in BASELINES
@@ -102,7 +102,7 @@ def _abroad() -> Claim:
 
 
 def _submodule(text: str, better: str, worse: str, env_config: str) -> Claim:
-    return Claim(text, tuple((Side(better, (hop,), env_config), Side(worse, (hop,), env_config)) for hop in HOPS))
+    return Claim(text, tuple((Operand(better, (hop,), env_config), Operand(worse, (hop,), env_config)) for hop in HOPS))
 
 
 CLAIMS = (
@@ -118,7 +118,7 @@ CLAIMS = (
     _best("ModGNN-MLP errs least with 16 agents at K = 2 and 3", "error", "N16", OTHERS, (2, 3)),
     Claim(
         "At K = 1 with 16 agents ModGNN-MLP [-f_mid] beats ModGNN-MLP",
-        ((Side("no_mid", (1,), "N16"), Side("modgnn_mlp", (1,), "N16")),),
+        ((Operand("no_mid", (1,), "N16"), Operand("modgnn_mlp", (1,), "N16")),),
     ),
     _abroad(),
     _submodule("f_pre matters more than f_mid: validation error", "no_mid", "no_pre", VALIDATION),
@@ -130,8 +130,8 @@ CLAIMS = (
 class Verdict:
     """What became of one comparison; ``chance`` is None where it was not measured."""
 
-    better: Side
-    worse: Side
+    better: Operand
+    worse: Operand
     chance: Interval | None
     means: tuple[float, float] | None
 
@@ -143,9 +143,9 @@ class Verdict:
         return "holds" if self.chance.low > 0.5 else "reversed" if self.chance.high < 0.5 else "undecided"
 
 
-def judge(claim: Claim, measurements: Measurements) -> tuple[str, list[Verdict]]:
+def judge(claim: Claim, results: Results) -> tuple[str, list[Verdict]]:
     """Whether a claim holds: all of its comparisons do; it does not as soon as one is the other way round."""
-    verdicts = [_compare(better, worse, measurements) for better, worse in claim.comparisons]
+    verdicts = [_compare(better, worse, results) for better, worse in claim.comparisons]
     words = {verdict.word for verdict in verdicts}
     for word, verdict in (("reversed", "does not hold"), ("not measured", "not measured"), ("undecided", "undecided")):
         if word in words:
@@ -153,8 +153,8 @@ def judge(claim: Claim, measurements: Measurements) -> tuple[str, list[Verdict]]
     return "holds", verdicts
 
 
-def _compare(better: Side, worse: Side, measurements: Measurements) -> Verdict:
-    first, second = better.values(measurements), worse.values(measurements)
+def _compare(better: Operand, worse: Operand, results: Results) -> Verdict:
+    first, second = better.values(results), worse.values(results)
     if first is None or second is None:
         return Verdict(better, worse, None, None)
     rng, paired = np.random.default_rng(0), better.env_config == worse.env_config
@@ -162,12 +162,12 @@ def _compare(better: Side, worse: Side, measurements: Measurements) -> Verdict:
     return Verdict(better, worse, chance, (float(first.mean()), float(second.mean())))
 
 
-def claim_tables(measurements: Measurements) -> dict[str, Table]:
+def claim_tables(results: Results) -> dict[str, Table]:
     """What holds of the claims, and every comparison."""
     rows: list[list[str | float]] = []
     details: list[list[str | float]] = []
     for number, claim in enumerate(CLAIMS, start=1):
-        word, verdicts = judge(claim, measurements)
+        word, verdicts = judge(claim, results)
         held, reversed_ = (sum(verdict.word == kind for verdict in verdicts) for kind in ("holds", "reversed"))
         known = [verdict.chance for verdict in verdicts if verdict.chance is not None]
         weakest = shown(min(known, key=lambda chance: chance.value), 2) if known else "-"
@@ -181,7 +181,7 @@ def claim_tables(measurements: Measurements) -> dict[str, Table]:
         "reversed where it lies below. A claim holds where all its comparisons do, and does not where one is reversed; "
         "else it is undecided at this size. Weakest: the lowest probability of improvement among them."
     )
-    if measurements.config.seeds == 1:
+    if results.config.seeds == 1:
         caption += " With one training of each model this tells of these trainings, not of the architectures."
     about = (
         "Probability that the first has the lower figure on a rollout, over all pairs of seeds (Agarwal et al. 2021), "
@@ -191,22 +191,22 @@ def claim_tables(measurements: Measurements) -> dict[str, Table]:
     every = ["claim", "comparison", "first", "second", "probability [95 %]", "here"]
     return {
         "claims": Table("What holds of the paper's orderings", header, rows, caption),
-        "margins": _margins(measurements),
+        "margins": _margins(results),
         "comparisons": Table("Every comparison", every, details, about),
     }
 
 
-def _margins(measurements: Measurements) -> Table:
+def _margins(results: Results) -> Table:
     """By how much ModGNN-MLP is better than the better of the two baselines, there and here."""
     paper = published()["model_evaluation"]
     body = []
     for hop in HOPS:
         models = ("modgnn_mlp", *BASELINES)
-        there, here = [paper[model][hop] for model in models], [Subject(model, hop) for model in models]
-        errors = [entry["error"] for entry in there], [mean(measurements, row, "N32", "error") for row in here]
+        there, here = [paper[model][hop] for model in models], [ModelVariant(model, hop) for model in models]
+        errors = [entry["error"] for entry in there], [mean(results, row, "N32", "error") for row in here]
         spreads = (
             [entry["separation"][1] for entry in there],
-            [spread(measurements, row, "separation")[1] for row in here],
+            [spread(results, row, "separation")[1] for row in here],
         )
         body.append([str(hop), *map(_less, (*errors, *spreads))])
     caption = (

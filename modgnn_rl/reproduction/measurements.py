@@ -1,4 +1,4 @@
-"""What is measured of a study's models: their errors on the expert's rollouts, and rollouts of their own."""
+"""Measurements of a study's models: validation error on expert episodes, and closed-loop rollouts."""
 
 from __future__ import annotations
 
@@ -19,60 +19,69 @@ from modgnn_rl.envs.flocking.metrics import action_error
 from modgnn_rl.evaluation.rollout import EpisodeMetrics, reference_policies, rollout
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import METRICS
-from modgnn_rl.reproduction.studies import Study, Subject, World
-from modgnn_rl.reproduction.tasks import Outcome, Result
+from modgnn_rl.reproduction.jobs import JobResults, Result
+from modgnn_rl.reproduction.studies import EvalSetting, ModelVariant, Study
 from modgnn_rl.tracking.loading import load_policy
 from modgnn_rl.trainers.imitation.loss import imitation_loss
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["VALIDATION", "Measurements", "flight_cell", "fly_references", "fly_subject", "look_on", "validate"]
+__all__ = [
+    "VALIDATION",
+    "Results",
+    "evaluate_references",
+    "evaluate_variant",
+    "evaluation_job",
+    "validate_references",
+    "validate_variant",
+]
 
-VALIDATION = "validation"  # the world of the expert's held-out rollouts
-STATES = 50  # of each held-out rollout that the validation error is taken on
-SPREADS = ("leader_distance", "cohesion", "separation")  # of which the spread over time and agents is kept, too
+REFERENCES = "references"  # jobs of the reference policies
+VALIDATION = "validation"  # the evaluation on expert episodes that are not trained on
+STATES = 50  # states of each of these episodes on which the validation error is measured
+SPREADS = ("leader_distance", "cohesion", "separation")  # metrics whose standard deviation over time is kept, too
 
 
-def flight_cell(config: ReproduceConfig, subject: Subject, seed: int, study: Study, env_config: str) -> str:
-    """The name of the cell in which a subject flies in a world."""
-    return f"{study.family}-{config.after}-{subject.key}-seed{seed}-{env_config}"
+def evaluation_job(config: ReproduceConfig, variant: ModelVariant, seed: int, study: Study, setting: str) -> str:
+    """The name of the job that evaluates a variant in a setting."""
+    return f"{study.family}-{config.after}-{variant.key}-seed{seed}-{setting}"
 
 
-def _policy(config: ReproduceConfig, folder: Path, subject: Subject, done: Mapping[str, Result]) -> ModGNN:
+def _policy(config: ReproduceConfig, folder: Path, variant: ModelVariant, done: Mapping[str, Result]) -> ModGNN:
     made = next(result for result in done.values() if "policies" in result)
-    return load_policy(folder / made["policies"][subject.key], device=config.device)
+    return load_policy(folder / made["policies"][variant.key], device=config.device)
 
 
-def fly_subject(
-    config: ReproduceConfig, folder: Path, subject: Subject, env_config: World, done: Mapping[str, Result]
+def evaluate_variant(
+    config: ReproduceConfig, folder: Path, variant: ModelVariant, setting: EvalSetting, done: Mapping[str, Result]
 ) -> Result:
-    """Fly a subject's policy in a world; its figures by name, one a flock."""
-    policy = _policy(config, folder, subject, done)
-    with Progress(f"{subject.key} flies in {env_config.name}", env_config.flocks * env_config.steps) as progress:
-        return _fly_in(policy, config, env_config, progress)
+    """Roll out a variant's policy in an evaluation setting; metrics by name, one value per episode."""
+    policy = _policy(config, folder, variant, done)
+    with Progress(f"{variant.key} in {setting.name}", setting.flocks * setting.steps) as progress:
+        return _evaluate(policy, config, setting, progress)
 
 
-def fly_references(config: ReproduceConfig, env_config: World, done: Mapping[str, Result]) -> Result:
-    """Fly the expert, the local experts and doing nothing in a world; their figures by name of the row."""
-    policies = reference_policies(_changed(config, env_config))
-    with Progress(
-        f"references fly in {env_config.name}", len(policies) * env_config.flocks * env_config.steps
-    ) as progress:
-        return {name: _fly_in(policy, config, env_config, progress) for name, policy in policies.items()}
+def evaluate_references(config: ReproduceConfig, setting: EvalSetting, done: Mapping[str, Result]) -> Result:
+    """Roll out the reference policies in an evaluation setting; their metrics by name of the policy."""
+    policies = reference_policies(_changed(config, setting))
+    with Progress(f"references in {setting.name}", len(policies) * setting.flocks * setting.steps) as progress:
+        return {name: _evaluate(policy, config, setting, progress) for name, policy in policies.items()}
 
 
-def _changed(config: ReproduceConfig, env_config: World) -> FlockingConfig:
-    return dataclasses.replace(config.env, num_agents=env_config.num_agents, **env_config.changes)
+def _changed(config: ReproduceConfig, setting: EvalSetting) -> FlockingConfig:
+    return dataclasses.replace(config.env, num_agents=setting.num_agents, **setting.changes)
 
 
-def _fly_in(policy: TensorDictModuleBase, config: ReproduceConfig, env_config: World, progress: Progress) -> Result:
-    """The figures of rollouts from the same starts for all policies and seeds."""
+def _evaluate(
+    policy: TensorDictModuleBase, config: ReproduceConfig, setting: EvalSetting, progress: Progress
+) -> Result:
+    """Metrics of rollouts from the same initial states for all policies and seeds."""
     rollouts = rollout(
         policy,
-        _changed(config, env_config),
-        num_agents=env_config.num_agents,
-        num_flocks=env_config.flocks,
-        steps=env_config.steps,
+        _changed(config, setting),
+        num_agents=setting.num_agents,
+        num_flocks=setting.flocks,
+        steps=setting.steps,
         seed=derive_seed(config.seed, "rollouts"),
         device=config.device,
         progress=progress,
@@ -90,12 +99,12 @@ def _figures(rollouts: EpisodeMetrics) -> Result:
 
 
 def _rounded(values: Sequence[float]) -> list[float]:
-    """Six digits of each: results are kept for good, and much is flown."""
+    """Six significant digits, to keep the stored results small."""
     return [float(f"{value:.6g}") for value in values]
 
 
-def _held_out(config: ReproduceConfig, folder: Path, length: int) -> Iterator[TensorDict]:
-    """Windows [T, W] of each of the expert's held-out rollouts, evenly over the rollout."""
+def _validation_windows(config: ReproduceConfig, folder: Path, length: int) -> Iterator[TensorDict]:
+    """Yield windows [T, W] of each validation episode, evenly spaced in time."""
     dataset = EpisodeDataset.open(folder / "dataset", verify=False, device=config.device)
     for episode in range(dataset.episodes - config.scale.val_episodes, dataset.episodes):
         steps = torch.linspace(0, dataset.steps - 1, min(STATES, dataset.steps)).round().long()
@@ -103,21 +112,23 @@ def _held_out(config: ReproduceConfig, folder: Path, length: int) -> Iterator[Te
 
 
 @torch.no_grad()
-def validate(config: ReproduceConfig, folder: Path, subject: Subject, done: Mapping[str, Result]) -> Result:
-    """The error of a policy that looks on while the expert flies, one a rollout."""
-    policy = _policy(config, folder, subject, done)
+def validate_variant(
+    config: ReproduceConfig, folder: Path, variant: ModelVariant, done: Mapping[str, Result]
+) -> Result:
+    """The error of a policy at the states of expert episodes, one value per episode."""
+    policy = _policy(config, folder, variant, done)
     errors = []
-    for windows in _held_out(config, folder, policy.window):
+    for windows in _validation_windows(config, folder, policy.window):
         errors.append(float(imitation_loss(policy, windows, windows["agents", "controlled"][:, -1])))
     return {"error": _rounded(errors)}
 
 
 @torch.no_grad()
-def look_on(config: ReproduceConfig, folder: Path, done: Mapping[str, Result]) -> Result:
-    """The error of each reference that looks on while the expert flies, one a rollout."""
+def validate_references(config: ReproduceConfig, folder: Path, done: Mapping[str, Result]) -> Result:
+    """The error of each reference policy at the states of expert episodes, one value per episode."""
     policies = reference_policies(config.env)
     errors: dict[str, list[float]] = {name: [] for name in policies}
-    for windows in _held_out(config, folder, 2):
+    for windows in _validation_windows(config, folder, 2):
         now = windows[:, -1]
         for name, policy in policies.items():
             seen = now.copy()
@@ -129,31 +140,31 @@ def look_on(config: ReproduceConfig, folder: Path, done: Mapping[str, Result]) -
     return {name: {"error": _rounded(values)} for name, values in errors.items()}
 
 
-class Measurements:
-    """What was measured, by row of a table and world.
+class Results:
+    """Measurements by row of a table and evaluation setting.
 
     Args:
-        outcome: of the cells of a study.
-        config: its settings.
+        outcome: results of the jobs of a study.
+        config: settings of the reproduction.
         study: the study.
     """
 
-    def __init__(self, outcome: Outcome, config: ReproduceConfig, study: Study) -> None:
+    def __init__(self, outcome: JobResults, config: ReproduceConfig, study: Study) -> None:
         self.outcome, self.config, self.study = outcome, config, study
 
-    def values(self, row: Subject | str, env_config: str, figure: str) -> NDArray[np.float64] | None:
-        """A figure of all rollouts [S, F] of each seed that did not fail; None where all did.
+    def values(self, row: ModelVariant | str, setting: str, metric: str) -> NDArray[np.float64] | None:
+        """Values of a metric [S, F] over seeds that did not fail and episodes; None where all failed.
 
         Args:
-            row: a subject, or the name of a reference.
-            env_config: name of the world.
-            figure: its name. What is no number counts as infinite: a rollout that ended nowhere.
+            row: a variant, or the name of a reference policy.
+            setting: name of the evaluation setting.
+            metric: name of the metric; NaN counts as infinite.
         """
         results = self.outcome.results
         if isinstance(row, str):
-            found = [results.get(f"references-{env_config}", {}).get(row)]
+            found = [results.get(f"{REFERENCES}-{setting}", {}).get(row)]
         else:
             seeds = range(self.config.seeds)
-            found = [results.get(flight_cell(self.config, row, seed, self.study, env_config)) for seed in seeds]
-        rows = [entry[figure] for entry in found if entry]
+            found = [results.get(evaluation_job(self.config, row, seed, self.study, setting)) for seed in seeds]
+        rows = [entry[metric] for entry in found if entry]
         return np.nan_to_num(np.array(rows, dtype=float), nan=np.inf, posinf=np.inf) if rows else None

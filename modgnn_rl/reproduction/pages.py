@@ -16,9 +16,9 @@ from modgnn_rl.reporting.plots import Curve, Estimate, draw_curves, draw_interva
 from modgnn_rl.reporting.report import Details, Figure, Section, gather_provenance, write_report
 from modgnn_rl.reporting.table import Table, as_csv, as_latex, as_markdown
 from modgnn_rl.reproduction.claims import claim_tables
-from modgnn_rl.reproduction.measurements import VALIDATION, Measurements
+from modgnn_rl.reproduction.measurements import VALIDATION, Results
 from modgnn_rl.reproduction.paper_tables import REFERENCES, middle, name_of, paper_tables, shown, title_of
-from modgnn_rl.reproduction.studies import FAULTS, HOPS, Subject, World, fault_name
+from modgnn_rl.reproduction.studies import HOPS, PERTURBATIONS, EvalSetting, ModelVariant, perturbation_name
 from modgnn_rl.utils.files import write_atomically
 
 if TYPE_CHECKING:
@@ -41,21 +41,21 @@ STAGES = {
 }
 
 
-def write_study(measurements: Measurements, folder: Path, started: datetime | None = None) -> Path:
+def write_study(results: Results, folder: Path, started: datetime | None = None) -> Path:
     """Write the tables of a study, each as CSV and LaTeX and all on one page, and the report.
 
     Args:
-        measurements: what was measured.
+        results: what was measured.
         folder: of the reproduction; the study has a folder of its own in it.
         started: when this command began, with a time zone.
 
     Returns:
         the path of ``report.html``; ``tables.md`` is beside it.
     """
-    config, outcome = measurements.config, measurements.outcome
+    config, outcome = results.config, results.outcome
     place = folder / (config.study if config.after == "cloning" else f"{config.study}-after-{config.after}")
     place.mkdir(parents=True, exist_ok=True)
-    tables, figures, text = _tabled(measurements) if config.study == "tables" else _studied(measurements)
+    tables, figures, text = _tabled(results) if config.study == "tables" else _studied(results)
     failed = "\n\n".join(f"Failed: {line}." for line in outcome.failure_lines())
     title = f"{QUESTIONS[config.study]} ({config.scale.name}, {config.seeds} seed{'s' if config.seeds > 1 else ''})"
     about = f"Policies made by {STAGES[config.after]}. {text}"
@@ -80,30 +80,30 @@ def _yaml(config: ReproduceConfig) -> str:
     return OmegaConf.to_yaml(OmegaConf.structured(config))
 
 
-def _tabled(measurements: Measurements) -> tuple[dict[str, Table], list[Figure], str]:
+def _tabled(results: Results) -> tuple[dict[str, Table], list[Figure], str]:
     """The paper's tables and claims."""
-    tables = {**claim_tables(measurements), **paper_tables(measurements)}
+    tables = {**claim_tables(results), **paper_tables(results)}
     order = ("claims", "margins", "table1", "table2", "table2_middle", "table3", "comparisons")
     figures = [
-        Figure("validation_error", _by_hops(measurements, VALIDATION), "Error on the expert's rollouts, m²/s²."),
-        Figure("error_in_flight", _by_hops(measurements, "N32"), "Error on rollouts of the models' own, m²/s²."),
+        Figure("validation_error", _by_hops(results, VALIDATION), "Error on the expert's rollouts, m²/s²."),
+        Figure("error_in_flight", _by_hops(results, "N32"), "Error on rollouts of the models' own, m²/s²."),
     ]
     return {name: tables[name] for name in order}, figures, "The figures of the paper stand beside those found here."
 
 
-def _estimate(measurements: Measurements, row: Subject | str, env_config: str) -> Estimate | None:
-    found = middle(measurements, row, env_config, "error")
+def _estimate(results: Results, row: ModelVariant | str, env_config: str) -> Estimate | None:
+    found = middle(results, row, env_config, "error")
     return None if found is None or not np.isfinite(found.high) else Estimate(found.value, found.low, found.high)
 
 
-def _by_hops(measurements: Measurements, env_config: str) -> Callable[[Canvas], None]:
+def _by_hops(results: Results, env_config: str) -> Callable[[Canvas], None]:
     """Draws a row for each model, a marker for each number of hops (and layers), the references as lines."""
     groups: dict[str, dict[str, Estimate]] = {}
-    for subject in measurements.study.subjects:
-        layers = "" if subject.layers is None else f"L = {subject.layers}, "
-        if (estimate := _estimate(measurements, subject, env_config)) is not None:
-            groups.setdefault(f"{layers}K = {subject.hops}", {})[name_of(subject.model)] = estimate
-    lines = {name: _estimate(measurements, name, env_config) for name in REFERENCES[2:]}
+    for variant in results.study.variants:
+        layers = "" if variant.layers is None else f"L = {variant.layers}, "
+        if (estimate := _estimate(results, variant, env_config)) is not None:
+            groups.setdefault(f"{layers}K = {variant.hops}", {})[name_of(variant.model)] = estimate
+    lines = {name: _estimate(results, name, env_config) for name in REFERENCES[2:]}
     references = {name: line.value for name, line in lines.items() if line is not None}
     return functools.partial(_draw_intervals, groups=groups, references=references)
 
@@ -112,120 +112,120 @@ def _draw_intervals(canvas: Canvas, groups: dict[str, dict[str, Estimate]], refe
     draw_intervals(canvas, groups, x_label="error, m²/s²", references=references, log_x=True)
 
 
-def _studied(measurements: Measurements) -> tuple[dict[str, Table], list[Figure], str]:
+def _studied(results: Results) -> tuple[dict[str, Table], list[Figure], str]:
     """A table of errors and one of lost flocks, a row for each model and a column for each world; a figure."""
-    config, study = measurements.config, measurements.study
+    config, study = results.config, results.study
     name = config.study
     if name in ("communication", "layers"):
-        figures = [Figure(name, _by_hops(measurements, "study-32"), "Error on rollouts of the models' own, m²/s².")]
-        worlds = {"expert's rollouts": VALIDATION, "own rollouts": "study-32"}
+        figures = [Figure(name, _by_hops(results, "study-32"), "Error on rollouts of the models' own, m²/s².")]
+        settings = {"expert's rollouts": VALIDATION, "own rollouts": "study-32"}
     else:
-        figures = (_curves_by_fault if name == "faults" else _curves_by_hops)(measurements)
-        worlds = {_heading(env_config): env_config.name for env_config in study.worlds}
-    usual = next(env_config.name for env_config in study.worlds if _is_usual(config, env_config))
-    tables = {"errors": _errors(measurements, "Errors", worlds, usual)}
+        figures = (_curves_by_fault if name == "faults" else _curves_by_hops)(results)
+        settings = {_heading(env_config): env_config.name for env_config in study.settings}
+    usual = next(env_config.name for env_config in study.settings if _is_usual(config, env_config))
+    tables = {"errors": _errors(results, "Errors", settings, usual)}
     if name == "faults":
-        tables = {f"errors_{fault}": table for fault, table in _errors_by_fault(measurements, usual)}
-    return {**tables, "lost": _lost(measurements, worlds)}, figures, _answer(measurements, worlds, usual)
+        tables = {f"errors_{fault}": table for fault, table in _errors_by_fault(results, usual)}
+    return {**tables, "lost": _lost(results, settings)}, figures, _answer(results, settings, usual)
 
 
-def _errors_by_fault(measurements: Measurements, usual: str) -> Iterator[tuple[str, Table]]:
+def _errors_by_fault(results: Results, usual: str) -> Iterator[tuple[str, Table]]:
     """A table for each fault, by its setting."""
-    for kind, levels in FAULTS.items():
-        worlds = {"as trained": usual, **{f"{level:g}": fault_name(change) for level, change in levels}}
-        yield next(iter(levels[0][1])), _errors(measurements, f"Errors by {kind}", worlds, usual)
+    for kind, levels in PERTURBATIONS.items():
+        settings = {"as trained": usual, **{f"{level:g}": perturbation_name(change) for level, change in levels}}
+        yield next(iter(levels[0][1])), _errors(results, f"Errors by {kind}", settings, usual)
 
 
-def _is_usual(config: ReproduceConfig, env_config: World) -> bool:
+def _is_usual(config: ReproduceConfig, env_config: EvalSetting) -> bool:
     same = all(getattr(config.env, name) == value for name, value in env_config.changes.items())
     return same and (env_config.num_agents == REFERENCE_SIZE or config.study != "size")
 
 
-def _heading(env_config: World) -> str:
+def _heading(env_config: EvalSetting) -> str:
     if env_config.name.startswith("size-"):
         return f"N = {env_config.num_agents}"
     return ", ".join(f"{name} {value}" for name, value in env_config.changes.items()) or "as trained"
 
 
-def _rows(measurements: Measurements) -> list[Subject | str]:
-    return [*REFERENCES, *measurements.study.subjects]
+def _rows(results: Results) -> list[ModelVariant | str]:
+    return [*REFERENCES, *results.study.variants]
 
 
-def _errors(measurements: Measurements, title: str, worlds: Mapping[str, str], usual: str) -> Table:
-    rises = len(worlds) > 2
+def _errors(results: Results, title: str, settings: Mapping[str, str], usual: str) -> Table:
+    rises = len(settings) > 2
     body: list[list[str | float]] = []
-    for row in _rows(measurements):
+    for row in _rows(results):
         cells: list[str | float] = [
-            shown(middle(measurements, row, env_config, "error")) for env_config in worlds.values()
+            shown(middle(results, row, env_config, "error")) for env_config in settings.values()
         ]
-        cells += [_rise(measurements, row, worlds, usual)] if rises else []
+        cells += [_rise(results, row, settings, usual)] if rises else []
         body.append([title_of(row), *cells])
     caption = (
         "Error against the expert's action, m²/s²: interquartile mean over seeds and rollouts with its 95 % interval."
     )
     if rises:
-        caption += " Rise: mean over the other worlds, minus the error in the world of training."
-    best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(worlds) + rises), "low")
-    header = ["model", *worlds, *(["rise"] if rises else [])]
-    return Table(title, header, body, f"{caption} {_flown(measurements)}", best, REFERENCES)
+        caption += " Rise: mean over the other settings, minus the error in the world of training."
+    best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(settings) + rises), "low")
+    header = ["model", *settings, *(["rise"] if rises else [])]
+    return Table(title, header, body, f"{caption} {_flown(results)}", best, REFERENCES)
 
 
-def _rise(measurements: Measurements, row: Subject | str, worlds: Mapping[str, str], usual: str) -> float:
-    found = {env_config: middle(measurements, row, env_config, "error") for env_config in {*worlds.values(), usual}}
+def _rise(results: Results, row: ModelVariant | str, settings: Mapping[str, str], usual: str) -> float:
+    found = {env_config: middle(results, row, env_config, "error") for env_config in {*settings.values(), usual}}
     values = {env_config: np.nan if interval is None else interval.value for env_config, interval in found.items()}
     return float(np.mean([value for env_config, value in values.items() if env_config != usual]) - values[usual])
 
 
-def _flown(measurements: Measurements) -> str:
-    flown = {(env_config.flocks, env_config.steps) for env_config in measurements.study.worlds}
+def _flown(results: Results) -> str:
+    flown = {(env_config.flocks, env_config.steps) for env_config in results.study.settings}
     rollouts = sorted({flocks for flocks, _ in flown})
     span = f"{rollouts[0]}" if len(rollouts) == 1 else f"{rollouts[0]} to {rollouts[-1]}"
-    return f"{span} rollouts of {measurements.study.worlds[0].steps} steps from the same starts for all rows."
+    return f"{span} rollouts of {results.study.settings[0].steps} steps from the same starts for all rows."
 
 
-def _lost(measurements: Measurements, worlds: Mapping[str, str]) -> Table:
-    flown = {heading: env_config for heading, env_config in worlds.items() if env_config != VALIDATION}
+def _lost(results: Results, settings: Mapping[str, str]) -> Table:
+    flown = {heading: env_config for heading, env_config in settings.items() if env_config != VALIDATION}
     body = []
-    for row in _rows(measurements):
-        shares = [measurements.values(row, env_config, "leader_lost") for env_config in flown.values()]
+    for row in _rows(results):
+        shares = [results.values(row, env_config, "leader_lost") for env_config in flown.values()]
         body.append([title_of(row), *("failed" if share is None else f"{share.mean():.0%}" for share in shares)])
     best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(flown)), "low")
     return Table("Share of flocks that lost their leader", ["model", *flown], body, "At the end.", best, REFERENCES)
 
 
-def _answer(measurements: Measurements, worlds: Mapping[str, str], usual: str) -> str:
+def _answer(results: Results, settings: Mapping[str, str], usual: str) -> str:
     """The best rows in words."""
-    subjects = measurements.study.subjects
-    errors = {title_of(row): middle(measurements, row, usual, "error") for row in subjects}
+    variants = results.study.variants
+    errors = {title_of(row): middle(results, row, usual, "error") for row in variants}
     known = {title: interval.value for title, interval in errors.items() if interval is not None}
     if not known:
         return "Nothing could be measured."
     text = f"Lowest error in the world of training: {min(known, key=known.__getitem__)}."
-    rises = {title_of(row): _rise(measurements, row, worlds, usual) for row in subjects}
+    rises = {title_of(row): _rise(results, row, settings, usual) for row in variants}
     others = {title: known[title] + rise for title, rise in rises.items() if title in known and np.isfinite(rise)}
-    if len(worlds) > 2 and others:
+    if len(settings) > 2 and others:
         text += f" Lowest mean error in the others: {min(others, key=others.__getitem__)}."
-        idle = middle(measurements, "zero action", usual, "error")
+        idle = middle(results, "zero action", usual, "error")
         able = {title: rises[title] for title in others if idle is not None and known[title] < idle.value}
         text += f" Least rise, of those better than doing nothing: {min(able, key=able.__getitem__)}." if able else ""
-    return f"{text} ModGNN-MLP's f_com is the Laplacian." if measurements.config.study == "communication" else text
+    return f"{text} ModGNN-MLP's f_com is the Laplacian." if results.config.study == "communication" else text
 
 
-def _curves_by_hops(measurements: Measurements) -> list[Figure]:
+def _curves_by_hops(results: Results) -> list[Figure]:
     """A figure for each K: errors over the communication range, or over the number of agents."""
-    study, is_size = measurements.study, measurements.config.study == "size"
+    study, is_size = results.study, results.config.study == "size"
     label = "agents" if is_size else "communication range, m"
     at = [
         (env_config.num_agents if is_size else env_config.changes["comm_range"], env_config.name)
-        for env_config in study.worlds
+        for env_config in study.settings
     ]
-    marks = {"trained": float(REFERENCE_SIZE) if is_size else measurements.config.env.comm_range}
+    marks = {"trained": float(REFERENCE_SIZE) if is_size else results.config.env.comm_range}
     return [
         Figure(
-            f"{measurements.config.study}_K{hops}",
+            f"{results.config.study}_K{hops}",
             functools.partial(
                 draw_curves,
-                curves=_curves(measurements, hops, at),
+                curves=_curves(results, hops, at),
                 x_label=label,
                 y_label="error, m²/s²",
                 marks=marks,
@@ -237,25 +237,25 @@ def _curves_by_hops(measurements: Measurements) -> list[Figure]:
     ]
 
 
-def _curves_by_fault(measurements: Measurements) -> list[Figure]:
+def _curves_by_fault(results: Results) -> list[Figure]:
     """A figure for each fault: errors of the models with K = 1 over its strength."""
     figures = []
-    for kind, levels in FAULTS.items():
-        at = [(0.0, "study-32"), *((level, fault_name(change)) for level, change in levels)]
-        draw = functools.partial(draw_curves, curves=_curves(measurements, 1, at), x_label=kind, y_label="error, m²/s²")
+    for kind, levels in PERTURBATIONS.items():
+        at = [(0.0, "study-32"), *((level, perturbation_name(change)) for level, change in levels)]
+        draw = functools.partial(draw_curves, curves=_curves(results, 1, at), x_label=kind, y_label="error, m²/s²")
         caption = f"Error on rollouts of the models' own over {kind}, K = 1; bands are 95 % intervals."
         figures.append(Figure(f"faults_{next(iter(levels[0][1]))}", draw, caption))
     return figures
 
 
-def _curves(measurements: Measurements, hops: int, at: Sequence[tuple[float, str]]) -> dict[str, Curve]:
-    """A curve for each model and two references, over levels with the names of their worlds."""
-    subjects = [subject for subject in measurements.study.subjects if subject.hops == hops]
-    rows: dict[str, Subject | str] = {name_of(subject.model): subject for subject in subjects}
-    rows |= {name: name for name in ("local expert (1 hop)", "zero action")}
+def _curves(results: Results, hops: int, at: Sequence[tuple[float, str]]) -> dict[str, Curve]:
+    """A curve for each model and two references, over levels with the names of their settings."""
+    variants = [variant for variant in results.study.variants if variant.hops == hops]
+    rows: dict[str, ModelVariant | str] = {name_of(variant.model): variant for variant in variants}
+    rows |= {"LocalReynolds": "local expert (1 hop)", "zero action": "zero action"}
     curves, unknown = {}, Estimate(np.nan, np.nan, np.nan)
     for name, row in rows.items():
-        found = [_estimate(measurements, row, env_config) or unknown for _, env_config in at]
+        found = [_estimate(results, row, env_config) or unknown for _, env_config in at]
         value, low, high = ([getattr(one, end) for one in found] for end in ("value", "low", "high"))
         curves[name] = Curve([level for level, _ in at], value, low, high)
     return curves

@@ -1,4 +1,4 @@
-"""The reproduction: its trainings, its measurements, its claims, its folder."""
+"""The reproduction: its trainings, its results, its claims, its folder."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.reporting.table import as_csv
 from modgnn_rl.reproduce import main
-from modgnn_rl.reproduction.claims import CLAIMS, Claim, Side, claim_tables, judge
+from modgnn_rl.reproduction.claims import CLAIMS, Claim, Operand, claim_tables, judge
 from modgnn_rl.reproduction.folder import claim_folder
-from modgnn_rl.reproduction.measurements import VALIDATION, Measurements
+from modgnn_rl.reproduction.jobs import JobResults, run_jobs
+from modgnn_rl.reproduction.measurements import VALIDATION, Results
 from modgnn_rl.reproduction.pages import write_study
 from modgnn_rl.reproduction.paper_tables import paper_tables, published
-from modgnn_rl.reproduction.pipeline import cells_of
-from modgnn_rl.reproduction.studies import Study, Subject, World, equal_hidden, study_of
-from modgnn_rl.reproduction.tasks import Outcome, run_cells
+from modgnn_rl.reproduction.pipeline import jobs_of
+from modgnn_rl.reproduction.store import ResultStore
+from modgnn_rl.reproduction.studies import EvalSetting, ModelVariant, Study, equal_hidden, study_of
 from modgnn_rl.tracking.loading import load_policy
 
 TINY = ScaleConfig(
@@ -29,7 +30,7 @@ TINY = ScaleConfig(
     sizes=[32], dagger_rounds=1, mappo_rounds=1, num_envs=2, study_updates=4,
     study_episodes=2, study_steps=8, study_sizes=[4, 32],
 )  # fmt: skip
-WORLD = World("N32", 32, 2, 8)
+WORLD = EvalSetting("N32", 32, 2, 8)
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +38,10 @@ def reproduction(tmp_path_factory):
     """Two GCNs trained side by side, and Central, all measured."""
     folder = tmp_path_factory.mktemp("reproduction")
     config = ReproduceConfig(scale=TINY)
-    study = Study("tables", [Subject("gcn", 1), Subject("gcn", 2), Subject("central", 1)], [WORLD], TINY.updates)
-    outcome = run_cells(folder / "cells", cells_of(config, study, folder))
+    study = Study(
+        "tables", [ModelVariant("gcn", 1), ModelVariant("gcn", 2), ModelVariant("central", 1)], [WORLD], TINY.updates
+    )
+    outcome = run_jobs(folder / "jobs", jobs_of(config, study, folder))
     assert not outcome.failures
     return folder, config, study, outcome
 
@@ -46,30 +49,36 @@ def reproduction(tmp_path_factory):
 def test_models_trained_apart_see_the_same_batches_as_side_by_side(reproduction, tmp_path):
     """Else the rows of the tables, which are trained in groups, would not be comparable."""
     folder, config, _, outcome = reproduction
-    alone = Study("alone", [Subject("gcn", 2)], [], TINY.updates)
+    alone = Study("alone", [ModelVariant("gcn", 2)], [], TINY.updates)
     (tmp_path / "dataset").symlink_to(folder / "dataset")
-    cells = [cell for cell in cells_of(config, alone, tmp_path) if "validation" not in cell.name]
-    apart = run_cells(tmp_path / "cells", cells)
+    jobs = [job for job in jobs_of(config, alone, tmp_path) if "validation" not in job.name]
+    apart = run_jobs(tmp_path / "jobs", jobs)
     (mine,) = (tmp_path / result["policies"]["gcn-K2"] for result in apart.results.values() if "policies" in result)
     beside = folder / outcome.results["tables-cloning-gcn-K12-seed0"]["policies"]["gcn-K2"]
     for name, weights in load_policy(mine).state_dict().items():
         torch.testing.assert_close(weights, load_policy(beside).state_dict()[name])
 
 
-def test_started_again_it_makes_what_is_missing_and_nothing_else(reproduction):
+def test_a_second_run_computes_only_what_is_missing(reproduction, monkeypatch):
     folder, config, study, outcome = reproduction
-    times = {file: file.stat().st_mtime_ns for file in (folder / "cells").glob("*.json")}
-    missing = folder / "cells" / "tables-cloning-gcn-K2-seed0-N32.json"
-    missing.unlink()
-    again = run_cells(folder / "cells", cells_of(config, study, folder))
+    missing = "tables-cloning-gcn-K2-seed0-N32"
+    store = ResultStore(folder / "jobs")
+    store.write("tables-cloning", missing, None)
+    write, written = ResultStore.write, []
+
+    def record(self, group, job, entry):
+        written.append(job)
+        write(self, group, job, entry)
+
+    monkeypatch.setattr(ResultStore, "write", record)
+    again = run_jobs(folder / "jobs", jobs_of(config, study, folder))
     assert again.results == outcome.results
-    changed = {file for file, time in times.items() if file.stat().st_mtime_ns != time}
-    assert changed == {missing}
+    assert set(written) == {missing}
 
 
 def test_the_references_have_the_errors_that_they_must_have(reproduction):
     _, config, study, outcome = reproduction
-    measured = Measurements(outcome, config, study)
+    measured = Results(outcome, config, study)
     for env_config in (VALIDATION, "N32"):
         expert, local, idle = (
             measured.values(name, env_config, "error") for name in ("expert", "local expert (1 hop)", "zero action")
@@ -81,7 +90,7 @@ def test_the_references_have_the_errors_that_they_must_have(reproduction):
 
 
 @torch.no_grad()
-def test_validation_is_the_error_of_a_policy_that_looks_on(reproduction):
+def test_validation_is_the_error_at_the_states_of_the_expert(reproduction):
     """An independent way to the same number: step by step, the policy's action written beside the expert's."""
     from tensordict import TensorDict
 
@@ -99,13 +108,13 @@ def test_validation_is_the_error_of_a_policy_that_looks_on(reproduction):
         difference = seen["agents", "action"] - now["agents", "expert_action"]
         errors.append(float(difference[0, 1:].square().mean()))
         state = seen
-    found = Measurements(outcome, config, study).values(Subject("gcn", 2), VALIDATION, "error")
+    found = Results(outcome, config, study).values(ModelVariant("gcn", 2), VALIDATION, "error")
     assert found[0, 0] == pytest.approx(np.mean(errors), rel=1e-4)  # all 30 states are fewer than the 50 taken
 
 
 def test_page_tables_and_report_are_written(reproduction):
     folder, config, study, outcome = reproduction
-    page = write_study(Measurements(outcome, config, study), folder)
+    page = write_study(Results(outcome, config, study), folder)
     text = page.with_name("tables.md").read_text()
     assert page.name == "report.html"
     for name in ("Table 1", "Table 2", "Table 3", "What holds", "zero action", "Central", "0.267"):
@@ -113,30 +122,30 @@ def test_page_tables_and_report_are_written(reproduction):
     assert {"table1.csv", "table1.tex", "table3.csv", "claims.tex"} <= {file.name for file in page.parent.iterdir()}
 
 
-def test_further_models_are_rows_beside_the_papers():
+def test_additional_models_are_rows_beside_the_papers():
     config = ReproduceConfig(scale=TINY, models=["gcn", "pair_force"], hops=[1, 4])
     study = study_of(config)
-    further = [subject for subject in study.subjects if subject not in study_of(ReproduceConfig(scale=TINY)).subjects]
-    assert further == [Subject("gcn", 4), Subject("pair_force", 1), Subject("pair_force", 4)]
-    measured = Measurements(Outcome({}, {}, {}), config, study)
+    further = [variant for variant in study.variants if variant not in study_of(ReproduceConfig(scale=TINY)).variants]
+    assert further == [ModelVariant("gcn", 4), ModelVariant("pair_force", 1), ModelVariant("pair_force", 4)]
+    measured = Results(JobResults({}, {}, {}), config, study)
     rows = [line.partition(",")[0] for line in as_csv(paper_tables(measured)["table1"]).splitlines()]
     assert rows[-1] == '"pair_force'
-    assert set(further) < set(study_of(dataclasses.replace(config, study="range")).subjects)
+    assert set(further) < set(study_of(dataclasses.replace(config, study="range")).variants)
 
 
 def test_without_further_models_nothing_needs_to_be_set():
     check(ReproduceConfig())
-    assert len(study_of(ReproduceConfig()).subjects) == 16
+    assert len(study_of(ReproduceConfig()).variants) == 16
     one = ReproduceConfig(models="pair_force", hops=2)
     check(one)
-    assert study_of(one).subjects[16:] == [Subject("pair_force", 2)]
+    assert study_of(one).variants[16:] == [ModelVariant("pair_force", 2)]
 
 
-def test_failed_cells_are_said_in_the_tables(reproduction, tmp_path):
+def test_failed_jobs_are_shown_in_the_tables(reproduction, tmp_path):
     _, config, study, outcome = reproduction
     lost = {name: result for name, result in outcome.results.items() if "gcn-K1-" not in name}
-    broken = Outcome(lost, outcome.seconds, {"tables-cloning-gcn-K1-seed0-N32": "no luck"})
-    page = write_study(Measurements(broken, config, study), tmp_path).with_name("tables.md").read_text()
+    broken = JobResults(lost, outcome.seconds, {"tables-cloning-gcn-K1-seed0-N32": "no luck"})
+    page = write_study(Results(broken, config, study), tmp_path).with_name("tables.md").read_text()
     assert "Failed: tables-cloning-gcn-K1-seed0-N32: no luck." in page
     row = next(line for line in page.splitlines() if line.startswith("| GCN, K = 1") and "0.363" in line)
     assert "failed" in row
@@ -147,7 +156,7 @@ def test_failed_cells_are_said_in_the_tables(reproduction, tmp_path):
 )
 def test_where_all_failed_the_page_says_so(tmp_path, study):
     config = ReproduceConfig(scale=TINY, study=study)
-    measured = Measurements(Outcome({}, {}, {"dataset": "the disk is full"}), config, study_of(config))
+    measured = Results(JobResults({}, {}, {"dataset": "the disk is full"}), config, study_of(config))
     page = write_study(measured, tmp_path).with_name("tables.md").read_text()
     assert "Failed: dataset: the disk is full." in page
     assert "failed" in page
@@ -161,7 +170,7 @@ def test_the_papers_figures_are_in_the_package():
 
 
 class Paper:
-    """Measurements that say what the paper's tables say: every rollout of a row has the paper's mean."""
+    """Results that say what the paper's tables say: every rollout of a row has the paper's mean."""
 
     config = ReproduceConfig(seeds=3)
 
@@ -198,7 +207,7 @@ def test_a_claim_is_reversed_undecided_or_not_measured():
             return None if found is None else np.array(found)
 
     def word(*pairs):
-        claim = Claim("", tuple((Side(better, (1,)), Side(worse, (1,))) for better, worse in pairs))
+        claim = Claim("", tuple((Operand(better, (1,)), Operand(worse, (1,))) for better, worse in pairs))
         return judge(claim, Made())[0]
 
     assert word(("gcn", "no_mid")) == "holds"
@@ -212,23 +221,23 @@ def test_a_claim_is_reversed_undecided_or_not_measured():
 def test_studies_at_equal_parameters_have_equal_parameters():
     from modgnn_rl.models.factory import make_model
 
-    def size(subject):
-        model = make_model(subject.model, subject.hops, subject.hidden, layers=subject.layers, seed=0)
+    def size(variant):
+        model = make_model(variant.model, variant.hops, variant.hidden, layers=variant.layers, seed=0)
         return sum(weights.numel() for weights in model.parameters())
 
-    sizes = [size(subject) for subject in study_of(ReproduceConfig(study="layers")).subjects]
+    sizes = [size(variant) for variant in study_of(ReproduceConfig(study="layers")).variants]
     assert max(sizes) < 1.06 * min(sizes)
     assert equal_hidden("modgnn_mlp", 1, 1) == 32
 
 
 @pytest.mark.parametrize("study", ["tables", "communication", "layers", "range", "faults", "size"])
-def test_the_cells_of_every_study_have_names_of_their_own_and_all_that_they_need(study, tmp_path):
+def test_jobs_of_every_study_have_unique_names_and_known_dependencies(study, tmp_path):
     config = ReproduceConfig(study=study, after="mappo", seeds=2)
-    cells = cells_of(config, study_of(config), tmp_path)
-    names = [cell.name for cell in cells]
+    jobs = jobs_of(config, study_of(config), tmp_path)
+    names = [job.name for job in jobs]
     assert len(set(names)) == len(names)
-    assert {need for cell in cells for need in cell.needs} <= set(names)
-    assert all(math.isfinite(cell.cost) and cell.cost > 0 for cell in cells)
+    assert {need for job in jobs for need in job.depends_on} <= set(names)
+    assert all(math.isfinite(job.cost) and job.cost > 0 for job in jobs)
 
 
 def test_a_folder_keeps_to_its_settings(tmp_path):
