@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 from modgnn_rl.errors import one_line
 from modgnn_rl.reproduction.store import ResultStore
 from modgnn_rl.utils.files import write_atomically
-from modgnn_rl.utils.text import as_span
+from modgnn_rl.utils.text import format_duration
 
 __all__ = ["Job", "JobResults", "Result", "run_jobs"]
 
@@ -214,5 +214,5 @@ class _Clock:
     def __str__(self) -> str:
         elapsed = time.monotonic() - self.begun
         known = self.cost > MIN_SHARE * (self.cost + self.left)
-        left = f", about {as_span(elapsed * self.left / self.cost)} left" if known else ""
+        left = f", about {format_duration(elapsed * self.left / self.cost)} left" if known else ""
         return f"[{self.number + 1}/{self.total}{left}]"
