@@ -252,7 +252,7 @@ def _curves(results: Results, hops: int, at: Sequence[tuple[float, str]]) -> dic
     """A curve for each model and two references, over levels with the names of their settings."""
     variants = [variant for variant in results.study.variants if variant.hops == hops]
     rows: dict[str, ModelVariant | str] = {name_of(variant.model): variant for variant in variants}
-    rows |= {"LocalReynolds": "local expert (1 hop)", "zero action": "zero action"}
+    rows |= {name: name for name in ("local expert (1 hop)", "zero action")}
     curves, unknown = {}, Estimate(np.nan, np.nan, np.nan)
     for name, row in rows.items():
         found = [_estimate(results, row, env_config) or unknown for _, env_config in at]
