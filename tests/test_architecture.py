@@ -29,13 +29,29 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+def exports() -> dict[str, str]:
+    """The names that packages export lazily, as ``modgnn_rl.nn.ModGNN``, and where they come from."""
+    found = {}
+    for name, path in MODULES.items():
+        stub = path.with_suffix(".pyi")
+        for node in ast.parse(stub.read_text(encoding="utf-8")).body if stub.exists() else []:
+            if isinstance(node, ast.ImportFrom):
+                found |= {f"{name}.{alias.name}": f"{name}.{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+EXPORTS = exports()
+
+
 def imports(module: str) -> set[str]:
     """The modules of the library that a module imports, in functions too, but not for type checking alone."""
-    return {
-        name if name in MODULES else name.rpartition(".")[0]
-        for name in _imported_names(ast.parse(MODULES[module].read_text(encoding="utf-8")))
-        if name.partition(".")[0] == "modgnn_rl"
-    } - {module}
+    found = set()
+    for name in _imported_names(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        while name in EXPORTS:
+            name = EXPORTS[name]
+        if name.partition(".")[0] == "modgnn_rl":
+            found.add(name if name in MODULES else name.rpartition(".")[0])
+    return found - {module}
 
 
 def _imported_names(node: ast.AST) -> Iterator[str]:
@@ -55,8 +71,8 @@ def package(module: str) -> str:
 
 
 def is_flocking(module: str) -> bool:
-    """Whether a module is part of the flocking task; ``modgnn_rl.envs`` exports its environment."""
-    return module == "modgnn_rl.envs" or module.startswith("modgnn_rl.envs.flocking")
+    """Whether a module is part of the flocking task."""
+    return module.startswith("modgnn_rl.envs.flocking")
 
 
 # Parts that are to know a task by `modgnn_rl.task` alone, once it is there.
@@ -93,6 +109,12 @@ def test_the_flocking_task_is_imported_where_listed_only(part: str) -> None:
     listed = {module for module in REMAINING if package(module) == f"modgnn_rl.{part}"}
     assert found - listed == set(), "import modgnn_rl.task instead"
     assert listed - found == set(), "remove these from REMAINING: they no longer import the flocking task"
+
+
+def test_settings_are_imported_from_the_schema() -> None:
+    parts = {"modgnn_rl.configs.flocking", "modgnn_rl.configs.trainers"}
+    direct = {module for module in MODULES if imports(module) & parts and package(module) != "modgnn_rl.configs"}
+    assert direct == set(), "import modgnn_rl.configs.schema instead"
 
 
 def test_the_reader_of_imports_sees_what_it_should() -> None:
