@@ -1,12 +1,19 @@
-"""Summaries over flocks and seeds with bootstrap intervals, in plain numpy.
+"""Summaries over episodes and seeds with bootstrap intervals, in plain numpy.
 
-The unit of all statistics is the flock (one episode): agents and time steps of one flock are not independent, so
-average over them first.
+The unit of all statistics is the episode of a flock: its agents and time steps are not independent, so average over
+them first.
+
+The bootstrap is hierarchical, with two levels (Davison and Hinkley 1997): a resample draws seeds with replacement and,
+within each of these, episodes with replacement; with one seed, it is Efron's (1979). The stratified bootstrap of
+Agarwal et al. (2021) differs: it resamples runs within each task and keeps all tasks. Intervals are percentiles of the
+resamples.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,55 +32,60 @@ __all__ = [
 
 BLOCK = 1 << 20  # values that are resampled at once
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class Summary:
-    """What a table shows of one metric over flocks, in the unit of the metric."""
+    """A metric over episodes, in its unit."""
 
     mean: float
     std: float
-    """Standard deviation over flocks, with n - 1 in the denominator; 0 for a single flock."""
+    """Standard deviation over episodes, with n - 1 in the denominator; 0 for a single episode."""
     median: float
     low: float
     """Lower end of the confidence interval of the mean."""
     high: float
     """Upper end of the confidence interval of the mean."""
     n: int
-    """Number of flocks."""
+    """Number of episodes."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value with its confidence interval."""
+
+    value: float
+    low: float
+    high: float
 
 
 def summarise(
     values: ArrayLike, *, rng: np.random.Generator, confidence: float = 0.95, resamples: int = 2000
 ) -> Summary:
-    """Mean, spread and percentile bootstrap interval of the mean (Efron 1979).
+    """Mean, standard deviation, median, and bootstrap interval of the mean.
 
     The order of the values does not matter: equal sets and generators give equal summaries.
 
     Args:
-        values: ``[F]``, one finite number for each flock.
-        rng: source of the resampling.
+        values: ``[F]``, one finite number per episode.
+        rng: random numbers of the bootstrap.
         confidence: coverage of the interval, above 0 and below 1.
-        resamples: bootstrap samples, at least 1.
+        resamples: number of bootstrap samples, at least 1.
 
     Raises:
-        InputError: no values, a value that is not finite, or a setting out of range.
+        InputError: no values, a value that is NaN or infinite, or a setting out of range.
     """
     data = _checked(values)
-    if not 0 < confidence < 1 or resamples < 1:
-        raise InputError(
-            f"confidence={confidence}, resamples={resamples}: give a confidence between 0 and 1 and resamples >= 1"
-        )
-    block = max(1, BLOCK // data.size)
-    draws = [min(block, resamples - done) for done in range(0, resamples, block)]
-    means = np.concatenate([data[rng.integers(data.size, size=(count, data.size))].mean(1) for count in draws])
-    tail = (1 - confidence) / 2
-    low, high = np.quantile(means, [tail, 1 - tail])
+    _check_settings(confidence, resamples)
+    means = _bootstrap(data[None], lambda rows: rows.mean(1), rng, resamples)
+    low, high = _percentiles(means, confidence, "linear")
     return Summary(
         mean=float(data.mean()),
         std=float(data.std(ddof=1)) if data.size > 1 else 0.0,
         median=float(np.median(data)),
-        low=float(low),
-        high=float(high),
+        low=low,
+        high=high,
         n=data.size,
     )
 
@@ -81,69 +93,56 @@ def summarise(
 def paired_difference(
     a: ArrayLike, b: ArrayLike, *, rng: np.random.Generator, confidence: float = 0.95, resamples: int = 2000
 ) -> Summary:
-    """Summary of ``a - b``, where both were measured on the same flocks (same starting states, same order).
+    """Summary of ``a - b``, both from the same initial states in the same order.
 
     Args:
         a: ``[F]``, finite.
         b: ``[F]``, finite.
-        rng: source of the resampling.
+        rng: random numbers of the bootstrap.
         confidence: coverage of the interval, above 0 and below 1.
-        resamples: bootstrap samples, at least 1.
+        resamples: number of bootstrap samples, at least 1.
 
     Raises:
-        InputError: different numbers of flocks, or as :func:`summarise`.
+        InputError: different numbers of episodes, or as :func:`summarise`.
     """
     first, second = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     if first.shape != second.shape:
-        raise InputError(f"shapes {first.shape} and {second.shape} cannot be paired; give values of the same flocks")
+        raise InputError(f"shapes {first.shape} and {second.shape} cannot be paired; give values of the same episodes")
     return summarise(first - second, rng=rng, confidence=confidence, resamples=resamples)
 
 
 def interquartile_mean(values: ArrayLike) -> float:
-    """Mean of the middle half: the lowest and the highest ``floor(F / 4)`` values are left out.
+    """Interquartile mean (IQM): the mean without the lowest and the highest ``floor(F / 4)`` values.
 
     Args:
         values: ``[F]``, finite.
 
     Raises:
-        InputError: no values, or a value that is not finite.
+        InputError: no values, or a value that is NaN or infinite.
     """
-    data = _checked(values)
-    cut = data.size // 4
-    return float(data[cut : data.size - cut].mean())
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A figure with its confidence interval."""
-
-    value: float
-    low: float
-    high: float
+    return float(_interquartile_means(_checked(values)[None])[0])
 
 
 def interquartile_interval(
     values: ArrayLike, *, rng: np.random.Generator, confidence: float = 0.95, resamples: int = 2000
 ) -> Interval:
-    """Interquartile mean over seeds and rollouts, and its stratified bootstrap interval (Agarwal et al. 2021).
+    """Interquartile mean over seeds and episodes, with its bootstrap interval.
 
-    A resample draws seeds with replacement, and then, within each seed drawn, rollouts with replacement. With one seed
-    the interval tells of rollouts only.
+    With one seed, the interval covers the variation between episodes only.
 
     Args:
-        values: ``[S, F]``, of each seed its rollouts; infinite values are allowed, they count as the worst.
-        rng: source of the resampling.
+        values: ``[S, F]``, one row per seed and one column per episode; infinite values count as the worst.
+        rng: random numbers of the bootstrap.
         confidence: coverage of the interval, above 0 and below 1.
-        resamples: bootstrap samples, at least 1.
+        resamples: number of bootstrap samples, at least 1.
 
     Raises:
         InputError: no values, a NaN, or a setting out of range.
     """
     data = _checked_matrix(values)
-    lot = _Lot(rng, resamples, confidence)
-    seeds, rollouts = data.shape
-    drawn = data[lot.draw(seeds, (seeds, 1)), lot.draw(rollouts, data.shape)].reshape(resamples, -1)
-    return lot.interval(float(_middle_mean(data.reshape(1, -1))[0]), _middle_mean(drawn))
+    _check_settings(confidence, resamples)
+    samples = _bootstrap(data, _interquartile_means, rng, resamples)
+    return Interval(float(_interquartile_means(data.reshape(1, -1))[0]), *_percentiles(samples, confidence, "nearest"))
 
 
 def probability_of_improvement(
@@ -157,87 +156,98 @@ def probability_of_improvement(
 ) -> Interval:
     """Probability that one policy has a lower value than another: ``P(X < Y) + P(X = Y) / 2`` (Agarwal et al. 2021).
 
-    The rollouts are Agarwal's tasks, the seeds the runs: where both flew the same rollouts, each rollout is compared
-    with itself, for all pairs of seeds. The interval is that of a bootstrap over the seeds of each and over the
-    rollouts.
+    Episodes are Agarwal's tasks, seeds the runs: if both policies had the same initial states, each episode is compared
+    with itself, for all pairs of seeds. The bootstrap resamples the seeds of each policy, and the episodes,
+    independently of each other.
 
     Args:
-        better: ``[S, F]``, of each seed of the one its rollouts; lower is better.
-        worse: ``[T, G]``, the same of the other.
-        rng: source of the resampling.
-        paired: rollout f of the one began like rollout f of the other (F = G); else every rollout meets every other.
+        better: ``[S, F]``, one row per seed and one column per episode; lower is better.
+        worse: ``[T, G]``, the same of the other policy.
+        rng: random numbers of the bootstrap.
+        paired: episode f of both started in the same state (F = G); else every episode is compared with every other.
         confidence: coverage of the interval, above 0 and below 1.
-        resamples: bootstrap samples, at least 1.
+        resamples: number of bootstrap samples, at least 1.
 
     Raises:
-        InputError: no values, a NaN, a setting out of range, or different rollouts where they should be paired.
+        InputError: no values, a NaN, a setting out of range, or different numbers of episodes to pair.
     """
     x, y = _checked_matrix(better), _checked_matrix(worse)
+    _check_settings(confidence, resamples)
     if paired and x.shape[1] != y.shape[1]:
-        raise InputError(f"{x.shape[1]} and {y.shape[1]} rollouts cannot be paired; give values of the same rollouts")
+        raise InputError(f"{x.shape[1]} and {y.shape[1]} episodes cannot be paired; give values of the same episodes")
     if paired:
         a, b, axes = x[:, None], y[None], "stf,rs,rt,rf->r"
     else:
         a, b, axes = x[:, None, :, None], y[None, :, None, :], "stfg,rs,rt,rf,rg->r"
     wins = (a < b) + (a == b) / 2
-    lot = _Lot(rng, resamples, confidence)
-    shares = [lot.shares(length) for length in wins.shape]
-    return lot.interval(float(wins.mean()), np.einsum(axes, wins, *shares, optimize=True))
+    # Of each axis, how often a resample contains each index, as a fraction [R, length].
+    weights = [rng.multinomial(n, np.full(n, 1 / n), size=resamples) / n for n in wins.shape]
+    samples = np.einsum(axes, wins, *weights, optimize=True)
+    return Interval(float(wins.mean()), *_percentiles(samples, confidence, "nearest"))
 
 
-@dataclass(frozen=True)
-class _Lot:
-    """Bootstrap samples, all drawn at once."""
+def _bootstrap(data: Array, statistic: Callable[[Array], Array], rng: np.random.Generator, resamples: int) -> Array:
+    """A statistic of resamples of the data [S, F]: seeds with replacement, then episodes within each seed.
 
-    rng: np.random.Generator
-    resamples: int
-    confidence: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.confidence < 1 or self.resamples < 1:
-            raise InputError(
-                f"confidence={self.confidence}, resamples={self.resamples}: give a confidence between 0 and 1 and "
-                "resamples >= 1"
-            )
-
-    def draw(self, length: int, shape: tuple[int, ...]) -> NDArray[np.int64]:
-        """Indices below ``length`` for each resample."""
-        return self.rng.integers(length, size=(self.resamples, *shape))
-
-    def shares(self, length: int) -> NDArray[np.float64]:
-        """How often each of ``length`` is drawn in each resample, in shares [R, length]."""
-        return self.rng.multinomial(length, np.full(length, 1 / length), size=self.resamples) / length
-
-    def interval(self, value: float, drawn: NDArray[np.float64]) -> Interval:
-        """Return a figure with the percentiles of its resamples [R]."""
-        tail = (1 - self.confidence) / 2
-        # Each end is a resample, not a mean of two: one of them may be infinite.
-        low, high = np.quantile(drawn, [tail, 1 - tail], method="nearest")
-        return Interval(value, float(low), float(high))
+    Args:
+        data: one row per seed, one column per episode.
+        statistic: of the rows of resampled values [R, S * F], gives [R].
+        rng: random numbers.
+        resamples: R.
+    """
+    seeds = rng.integers(len(data), size=(resamples, len(data), 1))
+    block = max(1, BLOCK // data.size)
+    found = []
+    for start in range(0, resamples, block):
+        some = seeds[start : start + block]
+        episodes = rng.integers(data.shape[1], size=(len(some), *data.shape))
+        found.append(statistic(data[some, episodes].reshape(len(some), -1)))
+    return np.concatenate(found)
 
 
-def _middle_mean(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def _percentiles(samples: Array, confidence: float, method: Literal["linear", "nearest"]) -> tuple[float, float]:
+    """Ends of the confidence interval; with infinite samples, ``nearest``, which never averages two of them."""
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(samples, [tail, 1 - tail], method=method)
+    return float(low), float(high)
+
+
+def _interquartile_means(rows: Array) -> Array:
     """Interquartile mean of each row [R, n] -> [R]."""
     cut = rows.shape[1] // 4
     return np.asarray(np.sort(rows, axis=1)[:, cut : rows.shape[1] - cut].mean(1))
 
 
-def _checked_matrix(values: ArrayLike) -> NDArray[np.float64]:
-    """Return the values as float64 [S, F], or raise InputError."""
+def _check_settings(confidence: float, resamples: int) -> None:
+    if not 0 < confidence < 1 or resamples < 1:
+        raise InputError(
+            f"confidence={confidence}, resamples={resamples}: give a confidence between 0 and 1 and resamples >= 1"
+        )
+
+
+def _checked_matrix(values: ArrayLike) -> Array:
+    """The values as float64 [S, F].
+
+    Raises:
+        InputError: they have another shape, or contain a NaN.
+    """
     data = np.asarray(values, dtype=np.float64)
     if data.ndim != 2 or data.size == 0:
-        raise InputError(f"values have shape {data.shape}; expected one row a seed and one column a rollout")
+        raise InputError(f"values have shape {data.shape}; expected one row per seed and one column per episode")
     if bad := int(np.isnan(data).sum()):
-        raise InputError(f"{bad} of {data.size} values are no numbers; count those rollouts as infinite, or say so")
+        raise InputError(f"{bad} of {data.size} values are NaN; replace the values of such episodes by infinity")
     return data
 
 
-def _checked(values: ArrayLike) -> NDArray[np.float64]:
-    """Return the values sorted, as float64, or raise InputError."""
+def _checked(values: ArrayLike) -> Array:
+    """The values sorted, as float64 [F].
+
+    Raises:
+        InputError: they have another shape, or one is NaN or infinite.
+    """
     data = np.asarray(values, dtype=np.float64)
     if data.ndim != 1 or data.size == 0:
-        raise InputError(f"values have shape {data.shape}; expected one number for each of at least one flock")
-    bad = int((~np.isfinite(data)).sum())
-    if bad:
-        raise InputError(f"{bad} of {data.size} values are not finite; leave those flocks out and report their share")
+        raise InputError(f"values have shape {data.shape}; expected one number for each of at least one episode")
+    if bad := int((~np.isfinite(data)).sum()):
+        raise InputError(f"{bad} of {data.size} values are NaN or infinite; leave such episodes out and say how many")
     return np.sort(data)

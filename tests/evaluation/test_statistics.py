@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from modgnn_rl.errors import InputError
+from modgnn_rl.evaluation import statistics as module
 from modgnn_rl.evaluation.statistics import (
     interquartile_interval,
     interquartile_mean,
@@ -79,7 +80,7 @@ def test_interquartile_mean(values: list[float], expected: float) -> None:
 
 def test_bad_values_are_refused() -> None:
     for call in (lambda v: summarise(v, rng=rng()), interquartile_mean):
-        with pytest.raises(InputError, match="1 of 3 values are not finite"):
+        with pytest.raises(InputError, match="1 of 3 values are NaN or infinite"):
             call([1.0, float("nan"), 2.0])
         with pytest.raises(InputError, match="shape"):
             call([])
@@ -98,7 +99,7 @@ def test_pairs_need_equal_shapes() -> None:
         paired_difference([1.0, 2.0], [1.0], rng=rng())
 
 
-def test_the_middle_interval_has_the_width_of_theory() -> None:
+def test_the_interquartile_interval_has_the_width_of_theory() -> None:
     """The 25 % trimmed mean of normal data has 1.195 times the variance of the mean (Stigler; Wilcox)."""
     values = rng(1).normal(size=(1, 2000))
     found = interquartile_interval(values, rng=rng(2), resamples=1500)
@@ -107,19 +108,19 @@ def test_the_middle_interval_has_the_width_of_theory() -> None:
     assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.1)
 
 
-def test_the_middle_interval_draws_seeds_and_flights_within_them() -> None:
-    """Seeds that differ while their rollouts do not: resamples are means over drawn seeds, of nothing in between."""
+def test_the_bootstrap_resamples_seeds_and_episodes_within_them() -> None:
+    """Seeds that differ while their rollouts do not: a resample averages whole seeds."""
     between = interquartile_interval(np.array([[0.0] * 50, [1.0] * 50]), rng=rng(), resamples=500)
     assert (between.low, between.value, between.high) == (0.0, 0.5, 1.0)
     same = interquartile_interval(np.full((3, 4), 2.5), rng=rng(), resamples=20)
     assert (same.low, same.value, same.high) == (2.5, 2.5, 2.5)
-    # Rollouts that differ while seeds do not: more seeds with as many rollouts narrow the interval.
+    # Episodes that differ while seeds do not: more seeds with as many episodes narrow the interval.
     rollouts = rng(3).normal(size=100)
     one, four = (interquartile_interval(np.tile(rollouts, (n, 1)), rng=rng(), resamples=800) for n in (1, 4))
     assert (four.high - four.low) == pytest.approx((one.high - one.low) / 2, rel=0.25)
 
 
-def test_one_infinite_flight_does_not_move_the_middle() -> None:
+def test_one_infinite_episode_does_not_move_the_interquartile_mean() -> None:
     found = interquartile_interval([[1.0, 2.0, 3.0, 4.0, np.inf, 0.0, 2.0, 3.0]], rng=rng(), resamples=200)
     assert found.value == 2.5
 
@@ -130,7 +131,7 @@ def test_one_infinite_flight_does_not_move_the_middle() -> None:
         ([[0.0, 0.0]], [[1.0, 1.0]], 1.0),
         ([[1.0, 1.0]], [[0.0, 0.0]], 0.0),
         ([[1.0, 1.0]], [[1.0, 1.0]], 0.5),
-        ([[0.0, 10.0]], [[1.0, 11.0]], 1.0),  # each rollout is compared with itself
+        ([[0.0, 10.0]], [[1.0, 11.0]], 1.0),  # each episode is compared with itself
         ([[0.0, 2.0]], [[1.0, 1.0]], 0.5),
         ([[0.0], [2.0]], [[1.0], [3.0]], 0.75),  # three of four pairs of seeds
         ([[0.0], [np.inf]], [[np.inf]], 0.75),
@@ -146,13 +147,13 @@ def test_probability_of_improvement_by_hand(
     assert opposite.value == pytest.approx(1 - expected)
 
 
-def test_flights_of_other_worlds_all_meet() -> None:
+def test_unpaired_episodes_are_all_compared_with_each_other() -> None:
     found = probability_of_improvement([[0.0, 10.0]], [[1.0, 11.0, 12.0]], rng=rng(), paired=False, resamples=50)
     assert found.value == pytest.approx(5 / 6)
 
 
 def test_probability_of_improvement_of_normal_data() -> None:
-    """P(X < Y) = Phi(d / sqrt 2) for normal data a distance d apart, with the variance of a share of rollouts."""
+    """P(X < Y) = Phi(d / sqrt 2) for normal data a distance d apart, with the variance of a fraction."""
     x, y = rng(5).normal(size=(1, 4000)), rng(6).normal(loc=1.0, size=(1, 4000))
     found = probability_of_improvement(x, y, rng=rng(7), resamples=800)
     wanted = statistics.NormalDist().cdf(1 / np.sqrt(2))
@@ -161,10 +162,17 @@ def test_probability_of_improvement_of_normal_data() -> None:
     assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.15)
 
 
+def test_blocks_do_not_change_the_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = rng(8).normal(size=(3, 20))
+    whole = summarise(values[0], rng=rng()), interquartile_interval(values, rng=rng())
+    monkeypatch.setattr(module, "BLOCK", 7 * 60)
+    assert (summarise(values[0], rng=rng()), interquartile_interval(values, rng=rng())) == whole
+
+
 def test_bad_matrices_are_refused() -> None:
     with pytest.raises(InputError, match="cannot be paired"):
         probability_of_improvement([[1.0, 2.0]], [[1.0]], rng=rng())
-    with pytest.raises(InputError, match="1 of 2 values are no numbers"):
+    with pytest.raises(InputError, match="1 of 2 values are NaN"):
         interquartile_interval([[1.0, float("nan")]], rng=rng())
     with pytest.raises(InputError, match="shape"):
         interquartile_interval([1.0, 2.0], rng=rng())
