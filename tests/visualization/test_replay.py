@@ -196,7 +196,7 @@ def _open(window, page):
 
 
 def _changes(window, act, what):
-    """An act changes what is shown and, a frame later, leaves a page that still draws."""
+    """An action changes what is shown, and the page still draws a frame later."""
     before, drawn = window.run(SHOWN), window.run("state.drawn")
     act()
     window.wait(f"{SHOWN} !== {before!r}")

@@ -1,4 +1,4 @@
-"""The flocking environment: its TorchRL interface, what it promises about seeds and resets, and its world's rules."""
+"""The flocking environment: its TorchRL interface, seeds and resets, and the rules of the task."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ACTION = ("agents", "action")
 
 
 def constant_policy(value: float):
-    """Everybody flies at ``value`` times a fixed pattern of target velocities."""
+    """A policy whose actions are ``value`` times a fixed pattern of target velocities."""
 
     def policy(td: TensorDictBase) -> TensorDictBase:
         agents = td["agents", "observation"][..., :3]
@@ -43,14 +43,14 @@ def constant_policy(value: float):
 
 
 def act(env: FlockingEnv, td: TensorDictBase, action: Tensor | float = 0.0) -> TensorDictBase:
-    """One step; returns the tensordict with the transition."""
+    """Take one step; returns the tensordict with the transition."""
     full = torch.zeros(*env.batch_size, env.num_agents, 3, dtype=env.dtype) + action
     td["agents", "action"] = full
     return env.step(td)
 
 
 def place(env: FlockingEnv, flock: int, position: Any) -> None:
-    """Put the agents of one flock at rest at ``position`` [N, 3]."""
+    """Place the agents of one flock at rest at ``position`` [N, 3]."""
     where = torch.as_tensor(position, dtype=env.dtype).unsqueeze(0)
     env.physics.reset(torch.tensor([flock]), where, torch.zeros_like(where))
 
@@ -103,7 +103,7 @@ def test_all_agents_are_one_group() -> None:
     assert env.group_map == {"agents": ["agent_0", "agent_1", "agent_2"]}
 
 
-def test_everybody_but_the_leader_is_controlled() -> None:
+def test_all_agents_but_the_leader_are_controlled() -> None:
     controlled = FlockingEnv(2, 4).reset()["agents", "controlled"]
     assert controlled.tolist() == [[False, True, True, True]] * 2
 
@@ -119,7 +119,7 @@ def test_observation_is_the_state_of_the_physics() -> None:
     assert float(observation[:, 1:, 3].min()) > 0.05
 
 
-def test_flocks_start_at_rest_apart_in_a_ball_that_grows_with_the_flock() -> None:
+def test_flocks_start_at_rest_and_apart_in_a_ball_that_scales_with_their_size() -> None:
     for size in (1, 4, 32):
         env = FlockingEnv(20, size, seed=0)
         observation = env.reset()["agents", "observation"]
@@ -134,7 +134,7 @@ def test_flocks_start_at_rest_apart_in_a_ball_that_grows_with_the_flock() -> Non
 # Seeds
 
 
-def test_one_seed_fixes_a_rollout_bit_for_bit() -> None:
+def test_one_seed_determines_a_rollout_bit_for_bit() -> None:
     state = torch.get_rng_state()
     rollouts = [
         FlockingEnv(3, 4, seed=seed, max_steps=7).rollout(20, constant_policy(1.0), break_when_any_done=False)
@@ -148,12 +148,12 @@ def test_one_seed_fixes_a_rollout_bit_for_bit() -> None:
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_without_a_seed_flights_differ() -> None:
+def test_without_a_seed_rollouts_differ() -> None:
     first, second = (FlockingEnv(2, 3).reset() for _ in range(2))
     assert not equal(first, second)
 
 
-def test_starts_and_leader_do_not_depend_on_the_policy() -> None:
+def test_initial_positions_and_leader_do_not_depend_on_the_policy() -> None:
     rollouts = [
         FlockingEnv(3, 4, seed=1, max_steps=9).rollout(24, constant_policy(value), break_when_any_done=False)
         for value in (0.0, 1.0, 50.0)
@@ -182,7 +182,7 @@ def test_leader_ignores_the_action_even_nan() -> None:
 
 
 def test_leader_velocity_is_integrated_gaussian_noise() -> None:
-    """After n steps its variance per component is n ls^2 dt; increments are independent, flocks too."""
+    """After n steps its variance per component is n ls^2 dt; increments and flocks are independent."""
     env = FlockingEnv(2000, 1, seed=0, leader_noise=0.3, leader_max_speed=math.inf, dtype=torch.float64)
     td, path = env.reset(), []
     for _ in range(6):
@@ -197,14 +197,14 @@ def test_leader_velocity_is_integrated_gaussian_noise() -> None:
     assert float(path[-1].std()) == pytest.approx(deviation * 6**0.5, rel=0.05)
 
 
-def test_leader_speed_has_a_cap() -> None:
+def test_leader_speed_is_limited() -> None:
     env = FlockingEnv(50, 1, seed=0, leader_noise=20.0, leader_max_speed=0.8)
     act(env, env.reset())
     speed = env.target_velocity[:, 0].norm(dim=-1)
     torch.testing.assert_close(speed, torch.full((50,), 0.8))
 
 
-def test_leader_flies_at_its_velocity() -> None:
+def test_leader_follows_its_target_velocity() -> None:
     env = FlockingEnv(4, 1, seed=0, leader_noise=0.0, velocity_gain=3.0)
     td = env.reset()
     assert isinstance(env.leader, NoiseLeader)
@@ -218,7 +218,7 @@ def test_leader_flies_at_its_velocity() -> None:
 
 
 def test_actions_are_projected_onto_the_ball_of_max_speed() -> None:
-    """Against a second engine flown with actions projected here: inside unchanged, outside to the sphere."""
+    """Compared with a second engine that gets projected actions: unchanged inside the ball, on the sphere outside."""
     env = FlockingEnv(2, 5, seed=0, dtype=torch.float64, max_speed=0.7)
     td = env.reset()
     twin = TorchPhysics(2, 5, dtype=torch.float64)
@@ -235,7 +235,7 @@ def test_actions_are_projected_onto_the_ball_of_max_speed() -> None:
         torch.testing.assert_close(env.physics.position, twin.position, rtol=0, atol=1e-13)
 
 
-def test_float32_actions_fly_a_float64_environment() -> None:
+def test_a_float64_environment_accepts_float32_actions() -> None:
     env = FlockingEnv(1, 2, dtype=torch.float64)
     td = env.reset()
     td["agents", "action"] = torch.zeros(1, 2, 3)
@@ -243,7 +243,7 @@ def test_float32_actions_fly_a_float64_environment() -> None:
 
 
 @pytest.mark.parametrize("value", [NAN, math.inf, -math.inf])
-def test_actions_that_are_not_finite_are_refused(value: float) -> None:
+def test_nan_and_infinite_actions_are_errors(value: float) -> None:
     env = FlockingEnv(3, 4, seed=0)
     td = step_mdp(act(env, step_mdp(act(env, env.reset()))))
     before = env.physics.position
@@ -257,7 +257,7 @@ def test_actions_that_are_not_finite_are_refused(value: float) -> None:
 # Who hears whom
 
 
-def test_adjacency_is_that_of_the_distances() -> None:
+def test_adjacency_follows_from_distances() -> None:
     rollout = FlockingEnv(3, 12, seed=0, comm_range=2.0).rollout(10, constant_policy(5.0))
     for side in (rollout, rollout["next"]):
         adjacency, position = side["adjacency"], side["agents", "observation"][..., :3]
@@ -269,7 +269,7 @@ def test_adjacency_is_that_of_the_distances() -> None:
                 assert torch.equal(adjacency[..., i, j], near if i != j else torch.zeros_like(near))
 
 
-def test_the_range_itself_is_heard() -> None:
+def test_agents_exactly_at_the_range_are_heard() -> None:
     env = FlockingEnv(2, 2, leader_noise=0.0, comm_range=3.5)
     td = env.reset()
     place(env, 0, line(0.0, 3.5))
@@ -282,7 +282,7 @@ def test_the_range_itself_is_heard() -> None:
 
 
 @pytest.mark.parametrize("graph", ["matrix", "links"])
-def test_reward_is_that_of_the_state_reached(graph: str) -> None:
+def test_reward_is_that_of_the_next_state(graph: str) -> None:
     env = FlockingEnv(2, 3, leader_noise=0.0, collision_distance=0.2, graph=graph)
     td = env.reset()
     place(env, 0, line(0.0, 1.0, 1.1))
@@ -335,8 +335,8 @@ def test_a_diverged_flock_is_terminated_and_only_it_restarts() -> None:
     assert env.step_count.flatten().tolist() == [1, 0, 1]
 
 
-def test_a_flock_is_terminated_when_too_many_agents_touch() -> None:
-    """Of four agents two touching are the share of one half that is allowed; three are more."""
+def test_an_episode_terminates_when_too_many_agents_collide() -> None:
+    """Of four agents, two in collision are the allowed fraction of one half; three are more."""
     env = FlockingEnv(4, 4, leader_noise=0.0, collision_distance=0.08, max_colliding=0.5)
     td = env.reset()
     place(env, 0, line(0.0, 0.07, 1.0, 2.0))
@@ -348,7 +348,7 @@ def test_a_flock_is_terminated_when_too_many_agents_touch() -> None:
     assert (td["next", "agents", "reward"][..., 0] < -0.9).sum(-1).tolist() == [2, 3, 0, 4]
 
 
-def test_staggered_flocks_end_their_first_episode_at_any_step() -> None:
+def test_staggered_flocks_end_their_first_episode_at_different_steps() -> None:
     options: dict[str, Any] = {"seed": 0, "max_steps": 10, "stagger": True}
     env = FlockingEnv(64, 2, **options)
     rollout = env.rollout(40, constant_policy(0.0), break_when_any_done=False)
@@ -374,7 +374,7 @@ def snapshot(env: FlockingEnv) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("mask", [[False, True, False, True], [True] * 4, [False] * 4])
-def test_a_partial_reset_touches_only_its_rows(mask: list[bool]) -> None:
+def test_a_partial_reset_changes_only_its_rows(mask: list[bool]) -> None:
     env = FlockingEnv(4, 3, seed=0)
     td = env.reset()
     for _ in range(5):
@@ -397,7 +397,7 @@ def test_a_partial_reset_touches_only_its_rows(mask: list[bool]) -> None:
     assert not out["done"].any()
 
 
-def test_what_is_stored_does_not_alias_the_state() -> None:
+def test_outputs_do_not_alias_the_state() -> None:
     env, twin = (FlockingEnv(1, 2, seed=0) for _ in range(2))
     td, other = env.reset(), twin.reset()
     for _ in range(4):
@@ -409,7 +409,7 @@ def test_what_is_stored_does_not_alias_the_state() -> None:
         td, other = following, step_mdp(other)
 
 
-def test_frames_of_a_rollout_differ() -> None:
+def test_steps_of_a_rollout_differ() -> None:
     observation = FlockingEnv(2, 3, seed=0).rollout(6, constant_policy(3.0))["agents", "observation"]
     for step in range(1, 6):
         assert (observation[:, step] != observation[:, 0]).any(-1).all()
@@ -419,7 +419,7 @@ def test_frames_of_a_rollout_differ() -> None:
 
 
 @pytest.mark.parametrize("how", ["setting", "configuration", "method"])
-def test_what_is_worth_it_is_compiled(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compile_covers_physics_graph_and_reward(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     names: list[str] = []
 
     def record(function: Any) -> Any:
@@ -440,7 +440,7 @@ def test_what_is_worth_it_is_compiled(how: str, monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.slow  # half a minute of compiling
 @pytest.mark.parametrize("settings", [{}, {"wind": 1.0, "drag": 1.0, "motor_lag": 0.05, "range_spread": 0.3}])
-def test_compiled_flights_are_those_of_eager_ones(settings: dict[str, Any]) -> None:
+def test_compiled_rollouts_equal_eager_ones(settings: dict[str, Any]) -> None:
     rollouts = []
     for is_compiled in (False, True):
         config = FlockingConfig(compile=is_compiled, **settings)
@@ -455,7 +455,7 @@ def test_compiled_flights_are_those_of_eager_ones(settings: dict[str, Any]) -> N
 
 
 @pytest.mark.parametrize("settings", [{}, {"range_spread": 0.4}, {"num_agents": [4, 20]}])
-def test_a_list_of_links_holds_the_links_of_the_matrix(settings: dict[str, Any]) -> None:
+def test_the_edge_list_holds_the_edges_of_the_matrix(settings: dict[str, Any]) -> None:
     dense, listed = (
         FlockingEnv(3, seed=0, graph=graph, **{"num_agents": 20, **settings}) for graph in ("matrix", "links")
     )
@@ -468,7 +468,7 @@ def test_a_list_of_links_holds_the_links_of_the_matrix(settings: dict[str, Any])
         assert torch.equal(torch.stack((receiver, sender), -1), matrix[flock].nonzero())
 
 
-def test_too_many_links_are_refused_by_name() -> None:
+def test_too_many_edges_are_an_error() -> None:
     env = FlockingEnv(2, 20, seed=0, graph="links", max_links=2)
     with pytest.raises(InputError, match=r"flock \d has \d+ edges, but its list holds only 40: raise env.max_links"):
         env.reset()
@@ -479,7 +479,7 @@ def test_too_many_links_are_refused_by_name() -> None:
     [make_model("modgnn_mlp", seed=0), LocalReynolds(action=ACTION), LocalReynolds(hops=2, action=ACTION)],
     ids=["policy", "local expert", "local expert, two hops"],
 )
-def test_lists_of_links_are_flown_by_as_the_matrix_is(policy: Any) -> None:
+def test_policies_act_equally_on_edge_lists_and_matrices(policy: Any) -> None:
     rollouts = []
     for graph in ("matrix", "links"):
         env = TransformedEnv(FlockingEnv(2, 12, seed=0, graph=graph), InitTracker())
@@ -489,7 +489,7 @@ def test_lists_of_links_are_flown_by_as_the_matrix_is(policy: Any) -> None:
 
 
 @pytest.mark.parametrize("graph", ["matrix", "links"])
-def test_nobody_hears_itself_however_far_it_hears(graph: str) -> None:
+def test_no_agent_receives_from_itself_whatever_the_range(graph: str) -> None:
     env = FlockingEnv(2, [3, 5], seed=0, comm_range=math.inf, graph=graph)
     adjacency = as_matrix(env.reset()["adjacency"], 5)
     assert not adjacency.diagonal(0, -2, -1).any()
@@ -499,7 +499,7 @@ def test_nobody_hears_itself_however_far_it_hears(graph: str) -> None:
 # Given states
 
 
-def test_flights_begin_at_given_states() -> None:
+def test_episodes_start_at_given_states() -> None:
     env = FlockingEnv(3, 4, seed=0)
     state = torch.randn(3, 4, 6, generator=torch.Generator().manual_seed(0))
     td = env.reset(TensorDict({"agents": {"state": state}}, [3]), set_state=True)
@@ -510,7 +510,7 @@ def test_flights_begin_at_given_states() -> None:
     assert not torch.equal(env.reset(flown.clone())["agents", "observation"], flown["agents", "observation"])
 
 
-def test_some_flocks_begin_at_given_states() -> None:
+def test_some_flocks_start_at_given_states() -> None:
     env = FlockingEnv(3, 4, seed=0)
     td = env.reset()
     given = td.clone().update(rows([False, True, False]))
@@ -529,13 +529,13 @@ def test_some_flocks_begin_at_given_states() -> None:
         (torch.full((2, 4, 6), NAN), "the state of agent 0 in flock 0 at step 0 is NaN or infinite"),
     ],
 )
-def test_states_that_are_none_are_refused(state: Tensor | None, message: str) -> None:
+def test_invalid_states_are_errors(state: Tensor | None, message: str) -> None:
     given = TensorDict({} if state is None else {"agents": {"state": state}}, [2])
     with pytest.raises(InputError, match=message):
         FlockingEnv(2, 4, seed=0).reset(given, set_state=True)
 
 
-def test_actions_of_another_shape_are_refused() -> None:
+def test_actions_of_another_shape_are_errors() -> None:
     env = FlockingEnv(2, 4, seed=0)
     td = env.reset()
     td["agents", "action"] = torch.zeros(2, 4, 2)
@@ -543,8 +543,8 @@ def test_actions_of_another_shape_are_refused() -> None:
         env.step(td)
 
 
-def test_agents_in_one_place_fly_on() -> None:
-    """Nothing divides by their distance: the rule is softened, and they count as touching."""
+def test_coincident_agents_keep_finite_states() -> None:
+    """Nothing divides by their distance: the rule is softened, and they count as in collision."""
     env = FlockingEnv(1, 4, seed=0, max_colliding=1.0)
     td = env.reset(TensorDict({"agents": {"state": torch.zeros(1, 4, 6)}}, [1]), set_state=True)
     for _ in range(10):
@@ -565,8 +565,8 @@ def test_specs_hold_for_flocks_of_different_size(graph: str) -> None:
     assert not td["agents", "observation"][~td["agents", "mask"]].any()
 
 
-def test_padding_touches_nothing() -> None:
-    """Rewards, the end of a rollout and the expert's labels are those of the flock without padding."""
+def test_padding_has_no_effect() -> None:
+    """Rewards, the end of the episode and the expert's labels are those of the flock without padding."""
     mixed, small = FlockingEnv(2, [3, 6], seed=0, leader_noise=0.0), FlockingEnv(1, 3, seed=0, leader_noise=0.0)
     td, expert = mixed.reset(), Reynolds(action=("agents", "action"))
     state = td["agents", "observation"][:1, :3]
@@ -603,24 +603,24 @@ def test_padding_touches_nothing() -> None:
         ((2, 3), {"config": FlockingConfig(), "comm_range": 2.0}, "either config or settings.*comm_range"),
     ],
 )
-def test_bad_settings_are_refused(arguments: tuple[Any, ...], settings: dict[str, Any], message: str) -> None:
+def test_bad_settings_are_errors(arguments: tuple[Any, ...], settings: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         FlockingEnv(*arguments, **settings)
 
 
-def test_flocks_that_do_not_fit_are_refused() -> None:
+def test_flocks_that_do_not_fit_are_errors() -> None:
     with pytest.raises(InputError, match=r"lower env\.start_distance or raise env\.start_radius"):
         FlockingEnv(1, 64, start_radius=1.0, start_distance=2.0).reset()
 
 
-def test_settings_and_config_build_the_same_world() -> None:
+def test_settings_and_config_create_equal_environments() -> None:
     one = FlockingEnv(2, seed=0, config=FlockingConfig(num_agents=5, leader_noise=1.0))
     two = FlockingEnv(2, 5, seed=0, leader_noise=1.0)
     assert one.num_agents == 5
     assert equal(one.rollout(5, constant_policy(1.0)), two.rollout(5, constant_policy(1.0)))
 
 
-def test_the_environment_does_not_move() -> None:
+def test_the_environment_cannot_be_moved() -> None:
     env = FlockingEnv(1, 2)
     assert env.to("cpu") is env
     with pytest.raises(InputError, match="create it with device='meta'"):
@@ -644,7 +644,7 @@ def test_specs_hold_on_a_gpu() -> None:
 
 
 def test_presets() -> None:
-    """S1 is the default; the paper's preset R differs in the separation and the leader."""
+    """``env=paper`` differs from the default in the separation and the leader."""
     preset = yaml.safe_load((Path(configs.__file__).parent / "env" / "paper.yaml").read_text())
     paper, default = FlockingConfig(**preset), FlockingConfig()
     check(paper, "env")
@@ -661,6 +661,6 @@ def test_sizes_are_a_list(given: Any, sizes: list[int]) -> None:
     assert FlockingConfig(num_agents=given).sizes == sizes
 
 
-def test_an_unknown_setting_is_refused_with_a_suggestion() -> None:
+def test_an_unknown_setting_is_an_error_with_a_suggestion() -> None:
     with pytest.raises(InputError, match="no setting comm_rnge; did you mean 'comm_range'"):
         FlockingEnv(1, 2, comm_rnge=3.0)

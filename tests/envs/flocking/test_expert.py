@@ -1,4 +1,4 @@
-"""The experts against the paper's equation, written as a double loop, and against its symmetries."""
+"""The experts against the paper's equation, written as a double loop, and against symmetries."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def paper(position: Tensor, velocity: Tensor, visible: Tensor, max_speed: float)
     return torch.tensor(actions, dtype=torch.float64)
 
 
-def everybody(agents: int) -> Tensor:
+def all_edges(agents: int) -> Tensor:
     return ~torch.eye(agents, dtype=torch.bool)
 
 
@@ -66,17 +66,17 @@ def test_reynolds_is_the_equation_of_the_paper(seed: int, agents: int, max_speed
     visible = random_graph(seed, agents=agents)
     restricted = reynolds(position, velocity, **GAINS, max_speed=max_speed, visible=visible)
     for number in range(2):
-        full = paper(position[number], velocity[number], everybody(agents), max_speed)
+        full = paper(position[number], velocity[number], all_edges(agents), max_speed)
         part = paper(position[number], velocity[number], visible, max_speed)
-        # The softening of 1e-6 m^2 is felt a little by agents that happen to be close.
+        # The softening of 1e-6 m^2 has a small effect on agents that happen to be close.
         torch.testing.assert_close(ours[number], full, rtol=1e-3, atol=1e-4)
         torch.testing.assert_close(restricted[number], part, rtol=1e-3, atol=1e-4)
 
 
-def test_softening_vanishes_at_flying_distances() -> None:
+def test_softening_is_negligible_at_usual_distances() -> None:
     position = torch.tensor([[0.0, 0, 0], [0.9, 0, 0], [0, 2.5, 0]], dtype=torch.float64)
     velocity = torch.tensor([[0.5, 0, 0], [0, 0.3, 0], [0, 0, -0.8]], dtype=torch.float64)
-    expected = paper(position, velocity, everybody(3), 1e9)
+    expected = paper(position, velocity, all_edges(3), 1e9)
     torch.testing.assert_close(reynolds(position, velocity, **FREE), expected, rtol=5e-6, atol=0)
 
 
@@ -114,7 +114,7 @@ def test_symmetries(seed: int, agents: int, determinant: int) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_agents_that_meet_stay_finite(dtype: torch.dtype) -> None:
+def test_coincident_agents_get_finite_actions(dtype: torch.dtype) -> None:
     position, velocity = (x.to(dtype).requires_grad_() for x in (torch.zeros(3, 3), torch.ones(3, 3)))
     action = reynolds(position, velocity, **GAINS, max_speed=0.92)
     assert not action.any()
@@ -133,7 +133,7 @@ def test_clipping_keeps_the_direction(seed: int) -> None:
     assert (torch.cosine_similarity(free, clipped, -1) > 1 - 1e-9).all()
 
 
-def test_the_module_is_the_function_with_the_gains_of_the_world() -> None:
+def test_the_module_is_the_function_with_the_gains_of_the_environment() -> None:
     position, velocity = flock(0, 2, 4)
     observation = torch.cat((position, velocity), -1)
     data = TensorDict({"agents": {"observation": observation}}, [2])
@@ -148,7 +148,7 @@ def test_the_module_is_the_function_with_the_gains_of_the_world() -> None:
 
 
 @given(seed=seeds, flocks=st.integers(0, 3), agents=sizes, budget=st.integers(1, 60))
-def test_blocks_change_nothing(seed: int, flocks: int, agents: int, budget: int) -> None:
+def test_results_do_not_depend_on_blocks(seed: int, flocks: int, agents: int, budget: int) -> None:
     state, visible = flock(seed, flocks, agents), random_graph(seed, flocks, agents=agents)
     whole = [reynolds(*state, **GAINS, max_speed=0.92, visible=seen) for seen in (None, visible)]
     with pytest.MonkeyPatch.context() as patch:
@@ -158,8 +158,8 @@ def test_blocks_change_nothing(seed: int, flocks: int, agents: int, budget: int)
 
 
 @pytest.mark.slow
-def test_the_rule_compiles_as_a_whole() -> None:
-    """The compiler sums in another order; what remains is rounding."""
+def test_the_rule_compiles_without_graph_breaks() -> None:
+    """The compiler sums in another order, so results differ by rounding."""
     position, velocity = (value.float() for value in flock(0, 4, 8))
     fast = torch.compile(reynolds, fullgraph=True, dynamic=False)
     choices: list[dict[str, Any]] = [
@@ -172,21 +172,21 @@ def test_the_rule_compiles_as_a_whole() -> None:
         torch.testing.assert_close(fast(position, velocity, **GAINS, max_speed=0.92, **options), expected)
 
 
-# What can be seen.
+# Visibility.
 
 
-def as_links(graph: Tensor, room: int) -> Tensor:
-    """Graphs [B, N, N] as lists of links in random order, with gaps [B, 2, room]."""
-    links = torch.full((len(graph), 2, room), -1)
+def as_links(graph: Tensor, capacity: int) -> Tensor:
+    """Graphs [B, N, N] as edge lists in random order, with gaps [B, 2, capacity]."""
+    links = torch.full((len(graph), 2, capacity), -1)
     for number, one in enumerate(graph):
         receiver, sender = one.nonzero().unbind(-1)
-        place = torch.randperm(room, generator=torch.Generator().manual_seed(number))[: len(sender)]
+        place = torch.randperm(capacity, generator=torch.Generator().manual_seed(number))[: len(sender)]
         links[number, 0, place], links[number, 1, place] = sender, receiver
     return links
 
 
 @given(seed=seeds, agents=sizes)
-def test_lists_of_links_are_the_matrix(seed: int, agents: int) -> None:
+def test_edge_lists_equal_the_matrix(seed: int, agents: int) -> None:
     state, graph = flock(seed, 3, agents), random_graph(seed, 3, agents=agents)
     links = as_links(graph, agents**2 + 3)
     assert torch.equal(as_matrix(links, agents), graph)
@@ -197,19 +197,19 @@ def test_lists_of_links_are_the_matrix(seed: int, agents: int) -> None:
     torch.testing.assert_close(of_one, expected[0])
 
 
-def test_links_of_agents_that_do_not_exist_are_refused() -> None:
+def test_edges_of_agents_that_do_not_exist_are_errors() -> None:
     links = torch.tensor([[[0, 3], [1, 0]]])
     with pytest.raises(InputError, match="numbers from 0 to 3"):
         reynolds(*flock(0, 1, 3), **GAINS, max_speed=0.92, visible=links)
 
 
 @given(seed=seeds, agents=sizes, form=st.sampled_from(["all", "matrix", "links"]), junk=st.floats())
-def test_agents_that_are_not_there_neither_see_nor_are_seen(seed: int, agents: int, form: str, junk: float) -> None:
+def test_absent_agents_neither_see_nor_are_seen(seed: int, agents: int, form: str, junk: float) -> None:
     position, velocity = flock(seed, 2, agents)
     mask = torch.rand(2, agents, generator=torch.Generator().manual_seed(seed)) < 0.6
     graph = random_graph(seed, 2, agents=agents, share=0.6)
     visible = {"all": None, "matrix": graph, "links": as_links(graph, agents**2)}[form]
-    seen = everybody(agents).expand(2, -1, -1) if form == "all" else graph
+    seen = all_edges(agents).expand(2, -1, -1) if form == "all" else graph
     expected = reynolds(
         position, velocity, **GAINS, max_speed=0.92, visible=seen & mask.unsqueeze(-1) & mask.unsqueeze(-2)
     )
@@ -219,7 +219,7 @@ def test_agents_that_are_not_there_neither_see_nor_are_seen(seed: int, agents: i
     assert not action[~mask].any()
 
 
-def test_the_expert_reads_the_mask_where_there_is_one() -> None:
+def test_the_expert_reads_the_mask_if_there_is_one() -> None:
     position, velocity = flock(1, 1, 5)
     observation = torch.cat((position, velocity), -1)
     observation[0, 3:] = torch.nan
@@ -229,7 +229,7 @@ def test_the_expert_reads_the_mask_where_there_is_one() -> None:
     assert not action[:, 3:].any()
 
 
-def test_the_expert_sees_the_truth_and_its_local_self_the_observation() -> None:
+def test_the_expert_reads_the_true_state_and_the_local_expert_the_observation() -> None:
     plain, noisy = FlockingConfig(), FlockingConfig(position_noise=0.1)
     assert Reynolds.for_env(plain).in_keys[0] == ("agents", "observation")
     assert Reynolds.for_env(noisy).in_keys[0] == ("agents", "state")
@@ -237,7 +237,7 @@ def test_the_expert_sees_the_truth_and_its_local_self_the_observation() -> None:
     assert LocalReynolds.for_env(noisy).in_keys[0] == ("agents", "observation")
 
 
-def hears_of(graph: Tensor, hops: int) -> Tensor:
+def within_hops(graph: Tensor, hops: int) -> Tensor:
     """Breadth-first search from every agent."""
     agents = len(graph)
     found = torch.zeros(agents, agents, dtype=torch.bool)
@@ -255,11 +255,11 @@ def hears_of(graph: Tensor, hops: int) -> Tensor:
 
 
 @given(seed=seeds, agents=sizes, hops=st.integers(1, 5))
-def test_reachable_is_a_search_of_the_graph(seed: int, agents: int, hops: int) -> None:
+def test_reachable_equals_a_breadth_first_search(seed: int, agents: int, hops: int) -> None:
     graph = random_graph(seed, 2, agents=agents)
     found = reachable(graph, hops)
     for number in range(2):
-        assert torch.equal(found[number], hears_of(graph[number], hops))
+        assert torch.equal(found[number], within_hops(graph[number], hops))
 
 
 def step(observation: Tensor, adjacency: Tensor, last: Tensor | None, is_init: Tensor | None = None) -> TensorDict:
@@ -272,14 +272,14 @@ def step(observation: Tensor, adjacency: Tensor, last: Tensor | None, is_init: T
 
 
 @given(seed=seeds, agents=sizes, hops=st.integers(1, 3))
-def test_local_reynolds_sees_yesterday_through_the_graph_of_today(seed: int, agents: int, hops: int) -> None:
+def test_local_reynolds_sees_the_last_observations_through_the_current_graph(seed: int, agents: int, hops: int) -> None:
     yesterday, today = (torch.cat(flock(seed + n, 2, agents), -1) for n in (0, 1))
     graph = random_graph(seed, 2, agents=agents)
     expert = LocalReynolds(hops=hops)
     out = expert(step(today, graph, yesterday, torch.zeros(2, 1, dtype=torch.bool)))
     for number in range(2):
         position, velocity = yesterday[number].split(3, -1)
-        visible = hears_of(graph[number], hops)
+        visible = within_hops(graph[number], hops)
         expected = paper(position, velocity, visible, 0.92)
         torch.testing.assert_close(out["agents", "expert_action"][number], expected, rtol=1e-3, atol=1e-4)
     assert torch.equal(out["next", "last_observation"], today)
@@ -287,7 +287,7 @@ def test_local_reynolds_sees_yesterday_through_the_graph_of_today(seed: int, age
 
 
 @given(seed=seeds, agents=sizes)
-def test_enough_hops_on_a_chain_see_everybody_one_step_late(seed: int, agents: int) -> None:
+def test_enough_hops_on_a_chain_see_all_agents_one_step_late(seed: int, agents: int) -> None:
     yesterday, today = (torch.cat(flock(seed + n, 1, agents), -1) for n in (0, 1))
     chain = torch.diag_embed(torch.ones(max(agents - 1, 0)), 1).bool() if agents > 1 else torch.zeros(1, 1).bool()
     chain = (chain | chain.mT).unsqueeze(0)
@@ -297,9 +297,9 @@ def test_enough_hops_on_a_chain_see_everybody_one_step_late(seed: int, agents: i
     torch.testing.assert_close(local[key], full[key])
 
 
-def test_the_first_step_of_an_episode_gives_no_action() -> None:
+def test_the_action_is_zero_at_the_first_step_of_an_episode() -> None:
     yesterday, today = (torch.cat(flock(n, 3, 4), -1) for n in (0, 1))
-    graph = everybody(4).expand(3, 4, 4)
+    graph = all_edges(4).expand(3, 4, 4)
     begins = torch.tensor([[False], [True], [False]])
     expert, key = LocalReynolds(), ("agents", "expert_action")
     free = expert(step(today, graph, yesterday))[key]
@@ -310,10 +310,10 @@ def test_the_first_step_of_an_episode_gives_no_action() -> None:
     assert not expert(step(today, graph, None))[key].any()
 
 
-def test_an_agent_of_which_nothing_is_stored_is_not_seen() -> None:
+def test_agents_without_a_stored_observation_are_not_seen() -> None:
     yesterday, today = (torch.cat(flock(n, 1, 4), -1) for n in (0, 1))
     yesterday[0, 2] = torch.nan
-    graph = everybody(4).unsqueeze(0)
+    graph = all_edges(4).unsqueeze(0)
     action = LocalReynolds()(step(today, graph, yesterday))["agents", "expert_action"][0]
     rest = [0, 1, 3]
     position, velocity = yesterday[0, rest].split(3, -1)
@@ -322,7 +322,7 @@ def test_an_agent_of_which_nothing_is_stored_is_not_seen() -> None:
 
 
 @given(seed=seeds, agents=sizes, hops=st.integers(1, 3))
-def test_local_reynolds_reads_lists_of_links(seed: int, agents: int, hops: int) -> None:
+def test_local_reynolds_reads_edge_lists(seed: int, agents: int, hops: int) -> None:
     yesterday, today = (torch.cat(flock(seed + n, 2, agents), -1) for n in (0, 1))
     yesterday[0, 0] = torch.nan
     graph, key = random_graph(seed, 2, agents=agents), ("agents", "expert_action")
@@ -332,11 +332,11 @@ def test_local_reynolds_reads_lists_of_links(seed: int, agents: int, hops: int) 
 
 
 @pytest.mark.parametrize("form", ["matrix", "links"])
-def test_one_that_comes_back_begins_with_nothing(form: str) -> None:
-    """Agent 2 is away at the second of four steps; what it observes then is worth nothing."""
+def test_an_agent_that_returns_has_no_stored_observation(form: str) -> None:
+    """Agent 2 is absent at the second of four steps; its observation then is ignored."""
     states = [torch.cat(flock(n, 1, 4), -1) for n in range(4)]
     states[1][0, 2] = 1.5
-    graph = everybody(4).unsqueeze(0)
+    graph = all_edges(4).unsqueeze(0)
     adjacency = graph if form == "matrix" else as_links(graph, 16)
     expert, last, actions = LocalReynolds(), None, []
     for number, state in enumerate(states):
@@ -347,7 +347,7 @@ def test_one_that_comes_back_begins_with_nothing(form: str) -> None:
         actions.append(out["agents", "expert_action"])
     assert not actions[0].any()
     rest = [0, 1, 3]
-    for number in (1, 2):  # away, and back without a memory: neither heard of nor moving
+    for number in (1, 2):  # absent, and back without a stored observation: neither seen nor moving
         position, velocity = states[number - 1][:, rest].split(3, -1)
         torch.testing.assert_close(actions[number][:, rest], reynolds(position, velocity, **GAINS, max_speed=0.92))
         assert not actions[number][:, 2].any()
@@ -355,7 +355,7 @@ def test_one_that_comes_back_begins_with_nothing(form: str) -> None:
 
 
 @pytest.mark.parametrize("hops", [0, -1, 1.5])
-def test_local_reynolds_needs_a_hop(hops: int) -> None:
+def test_local_reynolds_needs_at_least_one_hop(hops: int) -> None:
     with pytest.raises(InputError, match="hops="):
         LocalReynolds(hops=hops)
 

@@ -1,4 +1,4 @@
-"""Leaders: what each kind promises of its rollout."""
+"""Leaders: the properties of each kind of trajectory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CPU = torch.device("cpu")
 
 
 def lead(steps: int, position: Tensor | None = None, **settings: Any) -> tuple[Leader, Tensor]:
-    """Fly leaders that follow their target velocities exactly; their target velocities [T, B, 3]."""
+    """Target velocities [T, B, 3] of leaders that follow them exactly."""
     config = FlockingConfig(**settings)
     leader = make_leader(config, len(EVERYBODY), CPU, torch.float64)
     generator = torch.Generator().manual_seed(0)
@@ -54,7 +54,7 @@ def test_a_circle_closes() -> None:
     centre = path.mean(0)
     torch.testing.assert_close((path - centre).norm(dim=-1), torch.full_like(path[..., 0], radius), rtol=0.01, atol=0)
     headings = torch.atan2(flown[0, :, 1], flown[0, :, 0])
-    assert float(headings.std()) > 1.5  # they begin in all directions
+    assert float(headings.std()) > 1.5  # initial headings in all directions
 
 
 def test_waypoints_are_reached_one_after_the_other() -> None:
@@ -75,7 +75,7 @@ def test_waypoints_are_reached_one_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("kind", ["noise", "waypoints", "circle"])
-def test_a_reset_of_some_leaves_the_others_alone(kind: str) -> None:
+def test_a_partial_reset_leaves_the_other_leaders_alone(kind: str) -> None:
     leader, _ = lead(50, leader=kind)
     before = {name: value.clone() for name, value in vars(leader).items() if isinstance(value, Tensor)}
     leader.reset(torch.arange(500).unsqueeze(-1) < 3, torch.Generator().manual_seed(3))

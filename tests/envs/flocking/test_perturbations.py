@@ -1,4 +1,4 @@
-"""Perturbations: what each of them does, and that it does nothing else."""
+"""Perturbations: what each of them changes, and that it changes nothing else."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
 from modgnn_rl.models.factory import make_model
 
-FAULTS: dict[str, dict[str, Any]] = {
+PERTURBATIONS: dict[str, dict[str, Any]] = {
     "message_loss": {"message_loss": 0.3},
     "delay": {"delay": 3},
     "range_spread": {"range_spread": 0.5},
@@ -24,7 +24,7 @@ FAULTS: dict[str, dict[str, Any]] = {
     "dropout": {"dropout_rate": 1.0, "dropout_time": 0.5},
     "wind": {"wind": 1.0},
 }
-ALL = {name: value for fault in FAULTS.values() for name, value in fault.items()}
+ALL = {name: value for kind in PERTURBATIONS.values() for name, value in kind.items()}
 STATE = ("agents", "state")
 
 
@@ -38,26 +38,26 @@ def rollout(
 
 
 def idle(td: TensorDictBase) -> TensorDictBase:
-    """A policy that does nothing."""
+    """A policy with zero actions."""
     td["agents", "action"] = torch.zeros_like(td["agents", "observation"][..., :3])
     return td
 
 
-@pytest.mark.parametrize("settings", [*FAULTS.values(), ALL], ids=[*FAULTS, "all"])
+@pytest.mark.parametrize("settings", [*PERTURBATIONS.values(), ALL], ids=[*PERTURBATIONS, "all"])
 @pytest.mark.parametrize("graph", ["matrix", "links"])
 def test_specs_hold(settings: dict[str, Any], graph: str) -> None:
     check_env_specs(FlockingEnv(2, 5, seed=0, graph=graph, **settings))
 
 
-@pytest.mark.parametrize("settings", [*FAULTS.values(), ALL], ids=[*FAULTS, "all"])
-def test_one_seed_fixes_them(settings: dict[str, Any]) -> None:
+@pytest.mark.parametrize("settings", [*PERTURBATIONS.values(), ALL], ids=[*PERTURBATIONS, "all"])
+def test_one_seed_determines_them(settings: dict[str, Any]) -> None:
     first, second, other = (rollout(seed=seed, **settings) for seed in (1, 1, 2))
     assert bool((first == second).all())
     assert not torch.equal(first["agents", "observation"], other["agents", "observation"])
 
 
-@pytest.mark.parametrize("settings", FAULTS.values(), ids=FAULTS)
-def test_starts_and_leaders_are_those_of_a_world_without_faults(settings: dict[str, Any]) -> None:
+@pytest.mark.parametrize("settings", PERTURBATIONS.values(), ids=PERTURBATIONS)
+def test_initial_positions_and_leaders_do_not_depend_on_perturbations(settings: dict[str, Any]) -> None:
     worlds = [FlockingEnv(3, 4, seed=0, **chosen) for chosen in ({}, settings)]
     for env in worlds:
         env.rollout(20, idle, break_when_any_done=False)
@@ -66,7 +66,7 @@ def test_starts_and_leaders_are_those_of_a_world_without_faults(settings: dict[s
     assert torch.equal(worlds[0].target_velocity[:, 0], worlds[1].target_velocity[:, 0])
 
 
-@pytest.mark.parametrize("settings", [*FAULTS.values(), ALL], ids=[*FAULTS, "all"])
+@pytest.mark.parametrize("settings", [*PERTURBATIONS.values(), ALL], ids=[*PERTURBATIONS, "all"])
 def test_a_partial_reset_leaves_the_other_flocks_alone(settings: dict[str, Any]) -> None:
     env = FlockingEnv(3, 5, seed=0, **settings)
     td = env.rollout(10)[:, -1]["next"].clone()
@@ -77,9 +77,9 @@ def test_a_partial_reset_leaves_the_other_flocks_alone(settings: dict[str, Any])
     assert not torch.equal(after["agents", "observation"][1], td["agents", "observation"][1])
 
 
-@pytest.mark.parametrize("settings", FAULTS.values(), ids=FAULTS)
+@pytest.mark.parametrize("settings", PERTURBATIONS.values(), ids=PERTURBATIONS)
 @pytest.mark.parametrize("model", ["pair_force", "modgnn_mlp"])
-def test_policies_fly_unchanged(settings: dict[str, Any], model: str) -> None:
+def test_policies_roll_out_unchanged(settings: dict[str, Any], model: str) -> None:
     env = TransformedEnv(FlockingEnv(2, 5, seed=0, **settings), InitTracker())
     policy = make_model(model, seed=0)
     env.append_transform(policy.make_tensordict_primer())
@@ -90,7 +90,7 @@ def test_policies_fly_unchanged(settings: dict[str, Any], model: str) -> None:
 # Messages
 
 
-def test_lost_messages_are_as_many_as_asked_for_and_of_either_direction() -> None:
+def test_the_packet_loss_rate_holds_for_each_direction() -> None:
     whole, lossy = (FlockingEnv(50, 16, seed=0, message_loss=loss, comm_range=100.0).reset() for loss in (0, 0.25))
     links = whole["adjacency"]
     lost = links & ~lossy["adjacency"]
@@ -102,7 +102,7 @@ def test_lost_messages_are_as_many_as_asked_for_and_of_either_direction() -> Non
 
 
 @pytest.mark.parametrize("delay", [1, 4])
-def test_late_observations_are_those_of_some_steps_ago(delay: int) -> None:
+def test_delayed_observations_are_those_of_some_steps_ago(delay: int) -> None:
     rollouts = rollout(20, delay=delay)
     seen, state = rollouts["agents", "observation"], rollouts[STATE]
     assert torch.equal(seen[:, delay:], state[:, :-delay])
@@ -110,14 +110,14 @@ def test_late_observations_are_those_of_some_steps_ago(delay: int) -> None:
     assert torch.equal(rollouts["next", "agents", "observation"][:, :-1], seen[:, 1:])
 
 
-def test_delay_begins_anew_with_each_flight() -> None:
+def test_the_delay_restarts_with_each_episode() -> None:
     env = FlockingEnv(2, 3, seed=0, delay=2, max_steps=5)
     rollouts = env.rollout(12, break_when_any_done=False)
     for start in (0, 5, 10):
         assert torch.equal(rollouts["agents", "observation"][:, start], rollouts[STATE][:, start])
 
 
-def test_ranges_belong_to_senders_and_stay_for_a_flight() -> None:
+def test_ranges_belong_to_senders_and_are_constant_over_an_episode() -> None:
     env = FlockingEnv(20, 12, seed=0, range_spread=0.5, max_steps=10)
     rollouts = env.rollout(10)
     reach = env.perturbations.send_range
@@ -136,7 +136,7 @@ def test_ranges_belong_to_senders_and_stay_for_a_flight() -> None:
 # Sensors
 
 
-def test_noise_is_white_and_of_the_size_asked_for() -> None:
+def test_noise_is_white_with_the_given_standard_deviation() -> None:
     rollouts = rollout(50, num_envs=10, num_agents=8, position_noise=0.2, velocity_noise=0.03)
     error = rollouts["agents", "observation"] - rollouts[STATE]
     assert float(error[..., :3].std()) == pytest.approx(0.2, rel=0.03)
@@ -144,7 +144,7 @@ def test_noise_is_white_and_of_the_size_asked_for() -> None:
     assert abs(float((error[:, 1:] * error[:, :-1]).mean() / error.square().mean())) < 0.03
 
 
-def test_the_expert_sees_the_truth_and_others_the_observation() -> None:
+def test_the_expert_reads_the_true_state_and_policies_the_observation() -> None:
     env = FlockingEnv(3, 6, seed=0, position_noise=0.5)
     td = env.reset()
     truth = TensorDict({"agents": {"observation": td[STATE]}}, [3])
@@ -153,20 +153,20 @@ def test_the_expert_sees_the_truth_and_others_the_observation() -> None:
     assert LocalReynolds.for_env(env.config).in_keys[0] == ("agents", "observation")
 
 
-# Agents that drop out
+# Dropout
 
 
-def test_one_that_dropped_out_hovers_and_neither_hears_nor_is_heard() -> None:
+def test_a_dropped_out_agent_hovers_and_neither_sends_nor_receives() -> None:
     env = FlockingEnv(4, 6, seed=0, dropout_rate=1e-9, dropout_time=1e9, comm_range=100.0)
     env.reset()
     out = torch.zeros(4, 6, dtype=torch.bool)
     out[:, 2] = True
     env.perturbations.active = ~out
     td = env.reset().update(env.full_action_spec.zero())
-    assert bool(td["agents", "mask"].all())  # a reset brings all back
+    assert bool(td["agents", "mask"].all())  # a reset ends all dropouts
     env.perturbations.active = ~out
     td["agents", "action"] = torch.full((4, 6, 3), 0.5)
-    td["agents", "action"][:, 2] = math.nan  # nobody asks it
+    td["agents", "action"][:, 2] = math.nan  # ignored
     after = env.step(td)["next"]
     assert torch.equal(after["agents", "mask"], ~out)
     assert not after["agents", "controlled"][:, [0, 2]].any()
@@ -176,7 +176,7 @@ def test_one_that_dropped_out_hovers_and_neither_hears_nor_is_heard() -> None:
     assert not env.target_velocity[:, 2].any()
 
 
-def test_drop_outs_come_and_go_at_their_rates() -> None:
+def test_dropouts_start_and_end_at_their_rates() -> None:
     env = FlockingEnv(200, 6, seed=0, dropout_rate=0.5, dropout_time=2.0)
     env.reset()
     there = []
@@ -185,13 +185,13 @@ def test_drop_outs_come_and_go_at_their_rates() -> None:
         there.append(env.perturbations.active.clone())
     running = torch.stack(there)[:, :, 1:].double()
     assert bool(torch.stack(there)[:, :, 0].all())  # never the leader
-    # Two states with rates 0.5 and 1 / 2.0 a second: half of the time each, in the long run.
+    # Two states with rates 0.5 and 1 / 2.0 per second: half of the time each, in the long run.
     assert float(running[240:].mean()) == pytest.approx(0.5, abs=0.03)
     left = (running[:-1] == 1) & (running[1:] == 0)
     assert float(left.sum() / running[:-1].sum() * 48) == pytest.approx(0.5, abs=0.03)
 
 
-def test_what_dropped_out_reaches_nobody() -> None:
+def test_dropped_out_agents_influence_no_other() -> None:
     env = TransformedEnv(FlockingEnv(2, 6, seed=0, dropout_rate=1.0, dropout_time=0.3), InitTracker())
     policy = make_model("modgnn_mlp", hops=2, seed=0)
     env.append_transform(policy.make_tensordict_primer())
@@ -207,7 +207,7 @@ def test_what_dropped_out_reaches_nobody() -> None:
 # Wind
 
 
-def test_gusts_have_the_strength_and_the_memory_asked_for() -> None:
+def test_gusts_have_the_given_standard_deviation_and_correlation_time() -> None:
     env = FlockingEnv(300, 2, seed=0, wind=0.5, wind_time=0.5)
     env.reset()
     gusts: list[Tensor] = []
@@ -225,5 +225,5 @@ def test_wind_pushes_a_whole_flock() -> None:
     still, windy = (rollout(30, num_envs=2, num_agents=5, wind=strength) for strength in (0.0, 1.0))
     moved = (windy["agents", "observation"] - still["agents", "observation"])[:, -1, :, :3]
     assert float(moved.norm(dim=-1).min()) > 0.01
-    # The expert answers to shapes alone, which a push of all does not change; only the leader differs a little.
+    # The expert reacts to relative positions, which a common push does not change; only the leader differs.
     assert float((moved - moved.mean(1, keepdim=True)).norm(dim=-1).max()) < 0.3 * float(moved.norm(dim=-1).min())

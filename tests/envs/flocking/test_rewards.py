@@ -1,4 +1,4 @@
-"""The costs against their formulas written as a loop, and their invariances."""
+"""The costs against their formulas, written as a loop, and their invariances."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_costs_equal_their_formulas() -> None:
             assert found == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
-def test_reward_is_minus_the_weighted_sum_and_costs_without_weight_do_not_count() -> None:
+def test_reward_is_minus_the_weighted_sum_and_ignores_costs_without_weight() -> None:
     costs = {"leader": torch.tensor([[1.0, 2.0]]), "effort": torch.tensor([[3.0, math.nan]])}
     assert flocking_reward(costs, {"leader": 0.5}).tolist() == [[[-0.5], [-1.0]]]
     assert flocking_reward(costs, {}).tolist() == [[[0.0], [0.0]]]
@@ -55,7 +55,7 @@ def test_reward_is_minus_the_weighted_sum_and_costs_without_weight_do_not_count(
     assert reward_weights(config)["leader"] == 0.5
 
 
-def test_agents_that_do_not_exist_neither_count_nor_earn() -> None:
+def test_agents_that_do_not_exist_neither_count_nor_get_a_reward() -> None:
     position, velocity, target = random_step(2, 6, seed=2)
     weights = reward_weights(FlockingConfig())
     alone = flocking_reward(costs_of(position[:, :4], velocity[:, :4], target[:, :4]), weights)
@@ -67,19 +67,19 @@ def test_agents_that_do_not_exist_neither_count_nor_earn() -> None:
     assert not reward[:, 4:].any()
 
 
-def test_nothing_costs_on_the_leader_in_step_and_apart() -> None:
+def test_costs_are_zero_at_the_leader_with_equal_velocity_and_no_neighbour() -> None:
     position = torch.zeros(1, 4, 3)
     costs = flocking_costs(position, position + 2.0, position + 2.0, torch.full((1, 4), 1.0), **DISTANCES)
     assert not any(cost.any() for cost in costs.values())
 
 
-def test_an_agent_alone_meets_nobody() -> None:
+def test_a_single_agent_has_no_collision_or_crowding() -> None:
     costs = costs_of(*random_step(2, 1))
     assert not costs["crowding"].any()
     assert not costs["collision"].any()
 
 
-def test_costs_do_not_depend_on_the_place_or_the_common_velocity() -> None:
+def test_costs_are_invariant_to_position_and_common_velocity() -> None:
     position, velocity, target = random_step(2, 6, seed=1)
     shift, drift = random_step(2, 1, seed=3)[:2]
     moved = costs_of(position + shift, velocity + drift, target + drift)

@@ -1,4 +1,4 @@
-"""Rollouts that are interrupted go on bit for bit: all physics, leaders, faults and sizes."""
+"""Interrupted rollouts continue bit for bit: all physics, leaders, perturbations and sizes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WORLDS: dict[str, dict[str, Any]] = {
     "waypoints": {"leader": "waypoints", "leader_radius": 0.5},
     "circle": {"leader": "circle"},
     "outdoors": OUTDOORS,
-    "lost links": {"num_agents": [3, 6, 4], "graph": "links", "message_loss": 0.3, "wind": 1.0, "range_spread": 0.3},
+    "packet loss": {"num_agents": [3, 6, 4], "graph": "links", "message_loss": 0.3, "wind": 1.0, "range_spread": 0.3},
     "bullet": {"physics": "bullet", "dtype": torch.float64},
     "bullet outdoors": {"physics": "bullet", "motor_lag": 0.05, "ground": -1.5, **OUTDOORS, "dtype": torch.float64},
     "bullet collisions": {"physics": "bullet", "collisions": True, "dtype": torch.float64},
@@ -36,12 +36,12 @@ WORLDS: dict[str, dict[str, Any]] = {
 
 
 def make(seed: int = 0, num_envs: int = 3, **settings: Any) -> FlockingEnv:
-    """FlockBuffer whose rollouts end now and then."""
+    """An environment with short episodes."""
     return FlockingEnv(num_envs, seed=seed, stagger=True, **{"num_agents": 5, "max_steps": 9, **settings})
 
 
 def rollout(env: FlockingEnv, td: TensorDictBase, steps: int) -> tuple[list[TensorDictBase], TensorDictBase]:
-    """The expert's transitions, and the tensordict that is carried on."""
+    """The expert's transitions, and the tensordict to continue from."""
     rollout = []
     for _ in range(steps):
         transition, td = env.step_and_maybe_reset(EXPERT(td.clone()))
@@ -68,8 +68,8 @@ def assert_equal(rollout: list[TensorDictBase], other: list[TensorDictBase]) -> 
 
 
 @pytest.mark.parametrize("name", [*WORLDS, pytest.param("compiled", marks=pytest.mark.slow)])
-def test_flights_go_on_bit_for_bit(name: str) -> None:
-    """In an environment with another seed that was never reset, and in one that has flown elsewhere meanwhile."""
+def test_rollouts_continue_bit_for_bit(name: str) -> None:
+    """In an environment with another seed that was never reset, and in one used for other rollouts meanwhile."""
     settings = WORLDS.get(name, {"compile": True, "motor_lag": 0.05})
     env = make(**settings)
     _, td = rollout(env, env.reset(), 11)
@@ -79,12 +79,12 @@ def test_flights_go_on_bit_for_bit(name: str) -> None:
     for other in (fresh, env):
         resume(other, load(stored), states)
         assert_equal(rollout(other, carried.clone(), 16)[0], expected)
-    # They were in the middle of something, and all have begun anew since.
+    # The snapshot was taken within episodes, and all flocks have been reset since.
     assert torch.stack([td["next", "done"] for td in expected]).any(0).all()
 
 
-def test_agents_that_touch_go_on_up_to_rounding_in_bullet() -> None:
-    """A heap that is pushed together: a snapshot holds nothing of what Bullet remembers of contacts.
+def test_agents_in_contact_continue_up_to_rounding_in_bullet() -> None:
+    """Agents pushed together: a snapshot does not hold Bullet's record of contacts.
 
     So a rollout that goes on from it is not the old one to the last bit, but the same in whichever engine.
     """
@@ -107,8 +107,8 @@ def test_agents_that_touch_go_on_up_to_rounding_in_bullet() -> None:
     assert not torch.equal(one.position, engine.position)
 
 
-def test_a_snapshot_stands_apart() -> None:
-    """Neither rollouts change a snapshot, nor the other way round, before and after it is restored."""
+def test_a_snapshot_is_a_copy() -> None:
+    """Rollouts do not change a snapshot, nor the other way round, before and after it is restored."""
     env, twin = (make(seed=2, **OUTDOORS) for _ in range(2))
     _, td = rollout(env, env.reset(), 5)
     snapshot, states = env.snapshot(), generators(env)
@@ -121,7 +121,7 @@ def test_a_snapshot_stands_apart() -> None:
     assert_equal(rollout(twin, td, 5)[0], expected)
 
 
-def test_names() -> None:
+def test_names_of_tensors() -> None:
     names = set(make(motor_lag=0.05, range_spread=0.1).snapshot())
     bodies = {"position", "quaternion", "velocity", "spin", "integral", "rotors"}
     assert names == {
@@ -150,7 +150,7 @@ def test_names() -> None:
         ({"physics": "bullet"}, r"its physics\.integral is float64"),
     ],
 )
-def test_snapshots_of_another_world_are_refused(settings: dict[str, Any], message: str) -> None:
+def test_snapshots_of_other_settings_are_errors(settings: dict[str, Any], message: str) -> None:
     env = make()
     env.reset()
     before = env.snapshot()
@@ -162,7 +162,7 @@ def test_snapshots_of_another_world_are_refused(settings: dict[str, Any], messag
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@pytest.mark.parametrize("name", ["plain", "outdoors", "lost links", "bullet"])
+@pytest.mark.parametrize("name", ["plain", "outdoors", "packet loss", "bullet"])
 def test_snapshots_restore_on_another_device(name: str) -> None:
     env = make(device="cuda", **WORLDS[name])
     _, td = rollout(env, env.reset(), 11)

@@ -57,7 +57,7 @@ def brute_force(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def assert_optimal(points: Tensor, tolerance: float = 1e-12) -> None:
-    """A centre c is the best if and only if max_i |p_i - c - d|^2 >= r^2 + |d|^2 for every displacement d."""
+    """A centre c is optimal if and only if max_i |p_i - c - d|^2 >= r^2 + |d|^2 for every displacement d."""
     centre, radius = smallest_enclosing_sphere(points)
     assert torch.allclose((points - centre[:, None]).norm(dim=-1).amax(-1), radius, rtol=1e-15, atol=0)
     direction = torch.nn.functional.normalize(random_points(200, seed=1), dim=-1)
@@ -87,7 +87,7 @@ def test_integer_grids_match_brute_force(grid: list[tuple[int, int, int]]) -> No
     centre, radius = smallest_enclosing_sphere(torch.from_numpy(points))
     expected_centre, expected_radius = brute_force(points)
     assert float(radius) == pytest.approx(expected_radius, rel=0, abs=1e-12)
-    np.testing.assert_allclose(centre, expected_centre, rtol=0, atol=1e-6)  # equal reach fixes it to sqrt(rounding)
+    np.testing.assert_allclose(centre, expected_centre, rtol=0, atol=1e-6)  # up to sqrt(rounding)
 
 
 @pytest.mark.parametrize("num_points", [2, 3, 4, 5, 9])
@@ -164,6 +164,6 @@ def test_empty_batch() -> None:
 
 
 @pytest.mark.parametrize("shape", [(3,), (4, 2), (2, 0, 3)])
-def test_wrong_shapes_are_refused(shape: tuple[int, ...]) -> None:
+def test_wrong_shapes_are_errors(shape: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match="expected"):
         smallest_enclosing_sphere(torch.zeros(shape))

@@ -1,4 +1,4 @@
-"""Starting positions: distances, sizes, shapes, distribution, determinism and refusals."""
+"""Initial positions: distances, sizes, shapes, distribution, determinism and errors."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def test_positions_are_uniform_in_the_ball() -> None:
     torch.testing.assert_close(covariance, torch.eye(3).double() / 3, rtol=0, atol=0.02)
 
 
-def test_redrawing_keeps_the_sets_that_fit_already() -> None:
-    """The first draw is the same with and without a smallest distance; only agents in a close pair move."""
+def test_resampling_moves_only_agents_that_are_too_close() -> None:
+    """The first sample is the same with and without a minimum distance; only agents in a close pair move."""
     anywhere, apart = ball(50, 10, distance=0.0), ball(50, 10, distance=0.6)
     fits = (gaps(anywhere) > 0.6).all(-1).all(-1)
     assert 0 < int(fits.sum()) < 50
@@ -98,15 +98,15 @@ def test_redrawing_keeps_the_sets_that_fit_already() -> None:
     assert float(moved[~fits].double().mean()) < 0.5
 
 
-def test_the_generator_fixes_the_positions_and_nothing_else_is_drawn_from() -> None:
+def test_positions_depend_on_the_given_generator_alone() -> None:
     state = torch.get_rng_state()
     assert torch.equal(ball(3, 8, distance=1.0, seed=5), ball(3, 8, distance=1.0, seed=5))
     assert not torch.equal(ball(3, 8, distance=1.0, seed=5), ball(3, 8, distance=1.0, seed=6))
     assert torch.equal(state, torch.get_rng_state())
 
 
-def test_starts_of_known_seeds_stay_as_they_are() -> None:
-    """The figures in the documentation were flown from them."""
+def test_positions_of_known_seeds_do_not_change() -> None:
+    """The results in the documentation start from them."""
     known = [
         [-2.3196, 1.1190, 2.5424],
         [-0.4733, -3.6568, -1.3075],
@@ -116,7 +116,7 @@ def test_starts_of_known_seeds_stay_as_they_are() -> None:
     torch.testing.assert_close(ball(2, 4, distance=3.0, seed=7)[0], torch.tensor(known), rtol=0, atol=1e-4)
 
 
-def test_each_flock_may_have_a_radius_of_its_own() -> None:
+def test_each_flock_may_have_its_own_radius() -> None:
     radius = torch.tensor([0.5, 1.0, 4.0])
     together = ball(3, 20, radius=radius)
     for number, one in enumerate(radius.tolist()):
@@ -131,7 +131,7 @@ def test_each_flock_may_have_a_radius_of_its_own() -> None:
     seed=st.integers(0, 2**31),
 )
 @settings(max_examples=30)
-def test_all_starts_keep_agents_apart_about_the_origin(
+def test_all_starts_keep_agents_apart_around_the_origin(
     kind: str, flocks: int, agents: int, radius: float, seed: int
 ) -> None:
     distance = 0.3 * radius * agents ** (-1 / 3)
@@ -146,7 +146,7 @@ def test_all_starts_keep_agents_apart_about_the_origin(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_flocks_of_different_size(kind: str) -> None:
-    """Those that exist are apart, and as crowded as they would be alone; the rest may be anywhere."""
+    """Agents that exist are apart, with the density of a flock without padding; the others are anywhere."""
     sizes = torch.tensor([4, 32, 9])
     exists = torch.arange(32) < sizes.unsqueeze(-1)
     position = start(kind, 3, 32, 4.0 * (sizes / 32) ** (1 / 3), exists=exists)
@@ -161,8 +161,8 @@ def test_flocks_of_different_size(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_agents_that_do_not_exist_take_no_room(kind: str) -> None:
-    """Of forty agents three exist, wherever in the flock, in a ball that would not hold forty."""
+def test_agents_that_do_not_exist_take_no_space(kind: str) -> None:
+    """Of forty agents three exist, at any index, in a ball too small for forty."""
     exists = torch.zeros(20, 40, dtype=torch.bool)
     for number in range(20):
         exists[number, torch.randperm(40, generator=torch.Generator().manual_seed(number))[:3]] = True
@@ -172,7 +172,7 @@ def test_agents_that_do_not_exist_take_no_room(kind: str) -> None:
 
 
 def test_a_grid_is_a_cube_of_the_volume_of_the_ball() -> None:
-    """Of 27 agents each is a little off a site of its own, at most a quarter of the spacing."""
+    """Each of 27 agents is at its own site, up to an offset of at most a quarter of the spacing."""
     position = grid(5, 27, 3.0, 0.0, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     spacing = (4 / 3 * math.pi * 27) ** (1 / 3) / 3
     site = position / spacing
@@ -186,12 +186,12 @@ def test_a_grid_is_a_cube_of_the_volume_of_the_ball() -> None:
 
 @given(seed=st.integers(0, 2**31), agents=st.integers(6, 40), count=st.integers(1, 6))
 @settings(max_examples=30)
-def test_clusters_are_balls_that_do_not_touch(seed: int, agents: int, count: int) -> None:
+def test_clusters_are_balls_that_do_not_overlap(seed: int, agents: int, count: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     radius = 4.0 * count ** (-1 / 3)
     position = clusters(3, agents, 4.0, 0.0, count, generator=generator, dtype=torch.float64)
     for flock in position:
-        # Agents deal themselves out in turns, so that every count-th belongs to the same ball.
+        # Agents are assigned in turn, so that every count-th belongs to the same ball.
         balls = [flock[number::count] for number in range(count)]
         assert max(map(len, balls)) - min(map(len, balls)) <= 1
         for number, one in enumerate(balls):
@@ -209,12 +209,12 @@ def test_thousands_of_agents_start_apart() -> None:
         assert len(near_pairs(position, 0.3 * (1 - 1e-5))[0]) == 0
 
 
-def test_agents_that_do_not_fit_are_refused() -> None:
+def test_agents_that_do_not_fit_are_an_error() -> None:
     with pytest.raises(InputError, match=r"30 agents at least 1.0 m apart do not fit into a ball of radius 0.8 m"):
         ball(2, 30, radius=0.8, distance=1.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_start_hangs_where_agents_do_not_fit(kind: str) -> None:
+def test_no_start_hangs_when_agents_do_not_fit(kind: str) -> None:
     with pytest.raises(InputError, match=r"30 agents at least 1.0 m apart do not fit .* raise env.start_radius"):
         start(kind, 2, 30, 0.8, 1.0)

@@ -1,4 +1,4 @@
-"""The views for Gymnasium and PettingZoo: their own checkers, and agreement with the environment behind them."""
+"""The adapters for Gymnasium and PettingZoo: the libraries' checkers, and agreement with the environment."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ def actions(*shape: int, seed: int = 0) -> np.ndarray:
     "settings",
     [{}, {"physics": "bullet"}, {"dropout_rate": 0.5, "position_noise": 0.1}, {"graph": "links"}, {"num_agents": 1}],
 )
-def test_gymnasium_finds_nothing_wrong(settings: dict[str, Any]) -> None:
+def test_gymnasium_check_env_passes(settings: dict[str, Any]) -> None:
     env = make(**{"num_agents": 4, "width": 40, "height": 30, "render_mode": "rgb_array", **settings})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # What TorchRL and PyTorch warn of is none of ours.
+        # Deprecation warnings of TorchRL and PyTorch are not the adapter's.
         warnings.filterwarnings("ignore", category=DeprecationWarning)
         check_env(env.unwrapped)
     env.close()
 
 
-def test_it_is_the_environment_behind_it() -> None:
+def test_the_adapter_equals_the_environment() -> None:
     env, behind = make(), FlockingEnv(1, 4)
     observation, info = env.reset(seed=3)
     behind.set_seed(3)
@@ -68,7 +68,7 @@ def test_it_is_the_environment_behind_it() -> None:
     assert np.array_equal(info["target_velocity"], behind.target_velocity[0])
 
 
-def test_seeds_fix_flights_and_data_are_copies() -> None:
+def test_seeds_determine_rollouts_and_outputs_are_copies() -> None:
     rollouts = []
     for seed in (1, 1, 2):
         env = make()
@@ -80,13 +80,13 @@ def test_seeds_fix_flights_and_data_are_copies() -> None:
     assert not np.array_equal(rollouts[0], rollouts[2])
 
 
-def test_flights_end() -> None:
+def test_episodes_end() -> None:
     env = make(max_steps=3)
     env.reset(seed=0)
     assert [env.step(actions(4))[3] for _ in range(3)] == [False, False, True]
 
 
-def test_flights_begin_at_given_states() -> None:
+def test_episodes_start_at_given_states() -> None:
     state = np.arange(24.0).reshape(4, 6)
     observation, _ = make().reset(options={"state": state})
     assert np.array_equal(observation["observation"], state)
@@ -96,7 +96,7 @@ def test_flights_begin_at_given_states() -> None:
         make().reset(options={"sate": state})
 
 
-def test_what_there_is_not_is_refused() -> None:
+def test_invalid_settings_actions_and_modes_are_errors() -> None:
     with pytest.raises(TypeError, match="unexpected keyword argument 'comm_rage'; did you mean 'comm_range'"):
         make(comm_rage=3.0)
     with pytest.raises(InputError, match="comm_range=-1"):
@@ -130,7 +130,7 @@ def test_one_flock_in_a_batch_is_the_single_flock() -> None:
             assert "final_obs" not in info
 
 
-def test_spaces_hold_what_a_batch_emits() -> None:
+def test_observations_lie_in_their_spaces() -> None:
     batch = make_vec(3, dropout_rate=1.0, physics="torch")
     observation, _ = batch.reset(seed=[1, 2, 3])  # type: ignore[arg-type]
     for _ in range(3):
@@ -140,7 +140,7 @@ def test_spaces_hold_what_a_batch_emits() -> None:
     batch.close()
 
 
-def test_gymnasium_makes_batches_of_single_flocks_too() -> None:
+def test_gymnasium_vectorizes_single_flocks() -> None:
     batch = gymnasium.make_vec(NAME, 2, vectorization_mode="sync", num_agents=3)
     observation, _ = batch.reset(seed=0)
     assert observation["observation"].shape == (2, 3, 6)
@@ -156,11 +156,11 @@ def test_torchrl_wraps_it() -> None:
     assert rollout["next", "reward"].shape == (3, 1)
 
 
-def test_pettingzoo_finds_nothing_wrong() -> None:
+def test_pettingzoo_parallel_api_test_passes() -> None:
     parallel_api_test(parallel_env(num_agents=4, max_steps=10), num_cycles=30)
 
 
-def test_followers_hear_what_the_graph_lets_them() -> None:
+def test_followers_observe_their_neighbours_in_the_graph() -> None:
     env = parallel_env(num_agents=5, comm_range=1.5)
     observations, _ = env.reset(seed=0)
     assert list(observations) == env.agents == ["agent_1", "agent_2", "agent_3", "agent_4"]
@@ -175,7 +175,7 @@ def test_followers_hear_what_the_graph_lets_them() -> None:
         assert np.array_equal(observations[name]["observation"], everyone[index])
 
 
-def test_a_follower_flies_at_its_own_action() -> None:
+def test_a_follower_follows_its_own_action() -> None:
     env = parallel_env(num_agents=3)
     env.reset(seed=0)
     env.step({"agent_2": np.array([0.5, 0.0, 0.0])})
@@ -186,6 +186,6 @@ def test_a_follower_flies_at_its_own_action() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"), [({"num_agents": 1}, "leaves no agent to control"), ({"graph": "links"}, "matrix")]
 )
-def test_flocks_without_followers_are_refused(arguments: dict[str, Any], message: str) -> None:
+def test_flocks_without_followers_and_edge_lists_are_errors(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         parallel_env(**arguments)

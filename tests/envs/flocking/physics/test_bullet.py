@@ -1,4 +1,4 @@
-"""PyBullet against torch physics, flight by flight; laws that both keep; collisions, memory, the ends of clients."""
+"""PyBullet against torch physics; laws that both satisfy; collisions, resets, and the lifetime of clients."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ OPTIONS = {
 
 @pytest.fixture(autouse=True)
 def _collect() -> Iterator[None]:
-    """Engines of other tests give their clients back."""
+    """Free the clients of other tests' engines."""
     yield
     gc.collect()
 
@@ -104,7 +104,7 @@ def compare(options: dict[str, Any], *, seconds: int, wind: float = 0.0, seed: i
 
 
 @pytest.mark.parametrize("name", ["none", "ground", "all"])
-def test_flights_agree_with_torch(name: str) -> None:
+def test_trajectories_agree_with_torch(name: str) -> None:
     worst = compare(OPTIONS[name], seconds=3, wind=0.5 if name == "all" else 0.0)
     assert worst[torch.float64] < 1e-12
     assert worst[torch.float32] < 1e-3
@@ -113,13 +113,13 @@ def test_flights_agree_with_torch(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1, 5))
 @pytest.mark.parametrize("name", OPTIONS)
-def test_long_flights_agree_with_torch(name: str, seed: int) -> None:
+def test_long_trajectories_agree_with_torch(name: str, seed: int) -> None:
     worst = compare(OPTIONS[name], seconds=20, wind=0.5 if name == "all" else 0.0, seed=seed)
     assert worst[torch.float64] < 1e-12
     assert worst[torch.float32] < 1e-3
 
 
-def test_state_comes_in_the_wanted_type_and_starts_as_given() -> None:
+def test_state_has_the_requested_type_and_the_given_initial_value() -> None:
     start = random_start(2, 3, spin=5)
     for dtype in (torch.float32, torch.float64):
         engine = BulletPhysics(2, 3, dtype=dtype)
@@ -136,7 +136,7 @@ def test_state_comes_in_the_wanted_type_and_starts_as_given() -> None:
 
 @pytest.mark.parametrize("engine_type", ENGINES)
 def test_free_fall(engine_type: Engine) -> None:
-    """The parabola of the semi-implicit scheme, also beyond the 100 m/s to which Bullet limits bodies by itself."""
+    """The parabola of the semi-implicit scheme, also beyond 100 m/s, Bullet's default limit."""
     engine = engine_type(1, 1, Dynamics(vehicle=POWERLESS), dtype=torch.float64)
     start, steps = random_start(1, 1, spin=0), 12 * 240
     engine.reset(torch.arange(1), *start)
@@ -185,7 +185,7 @@ def test_tumbling_keeps_energy_and_angular_momentum(engine_type: Engine) -> None
 
 @pytest.mark.parametrize("engine_type", ENGINES)
 def test_floor_holds_without_friction(engine_type: Engine) -> None:
-    """Agents that fall on it glide on at the speed they have, and do not turn; they sink in by less than a substep."""
+    """Agents that fall on it keep their horizontal speed and do not turn; they sink in by less than a substep."""
     engine = engine_type(1, 2, Dynamics(ground=-2.0, vehicle=POWERLESS), dtype=torch.float64)
     position = torch.tensor([[[0.0, 0, -1], [5, 0, -1.9]]], dtype=torch.float64)
     velocity = torch.tensor([[[1.0, -2, 0], [0, 0, -3]]], dtype=torch.float64)
@@ -203,7 +203,7 @@ def test_floor_holds_without_friction(engine_type: Engine) -> None:
 
 
 def meet(collisions: bool, offset: float = 0.0) -> BulletPhysics:
-    """Two powerless agents that fly into each other along x at 1 m/s each, half a second later."""
+    """Two unpowered agents that collide along x at 1 m/s each, half a second later."""
     engine = BulletPhysics(1, 2, Dynamics(vehicle=POWERLESS), collisions=collisions, dtype=torch.float64)
     position = torch.tensor([[[-0.25, 0, 0], [0.25, offset, 0]]], dtype=torch.float64)
     engine.reset(torch.arange(1), position, torch.tensor([[[1.0, 0, 0], [-1, 0, 0]]], dtype=torch.float64))
@@ -217,7 +217,7 @@ def meet(collisions: bool, offset: float = 0.0) -> BulletPhysics:
 
 @pytest.mark.parametrize("offset", [0.0, 0.03])
 def test_agents_that_collide_keep_their_momentum(offset: float) -> None:
-    """They do not pass each other, and all but what parts them slowly is gone along the line between them."""
+    """They do not pass each other, and along the line between them only a slow separation velocity remains."""
     engine = meet(collisions=True, offset=offset)
     total = engine.velocity.sum(1)
     torch.testing.assert_close(total, torch.tensor([[0, 0, -GRAVITY]], dtype=torch.float64), rtol=0, atol=1e-9)
@@ -227,12 +227,12 @@ def test_agents_that_collide_keep_their_momentum(offset: float) -> None:
         assert 0 <= float(engine.velocity[0, 1, 0]) < 0.1
 
 
-def test_agents_pass_each_other_where_they_do_not_collide() -> None:
+def test_agents_pass_each_other_without_collisions() -> None:
     engine = meet(collisions=False)
     assert float(engine.position[0, 0, 0]) == pytest.approx(0.25, abs=1e-12)
 
 
-def test_agents_in_one_place_are_pushed_apart() -> None:
+def test_coincident_agents_are_pushed_apart() -> None:
     engine = BulletPhysics(1, 3, collisions=True)
     engine.reset(torch.arange(1), torch.zeros(1, 3, 3), torch.zeros(1, 3, 3))
     for _ in range(96):
@@ -245,7 +245,7 @@ def test_agents_in_one_place_are_pushed_apart() -> None:
 
 
 def crowd(engine: BulletPhysics, flock: int, seed: int) -> None:
-    """Put a flock where its agents touch."""
+    """Place a flock with its agents in contact."""
     position = 0.1 * randn(1, 4, 3, seed=seed)
     engine.reset(torch.tensor([flock]), position, zeros(1, 4, 3))
 
@@ -257,7 +257,7 @@ def fly_on(engine: BulletPhysics, steps: int, seed: int) -> Tensor:
 
 
 def test_resets_leave_no_trace() -> None:
-    """Bit for bit, with contacts: what is reset flies as in a new engine, and the others as if nothing had happened."""
+    """Bit for bit, with contacts: reset flocks behave as in a new engine, and the others as without the reset."""
     dynamics = Dynamics(ground=-0.2)
     engines = [BulletPhysics(2, 4, dynamics, collisions=True, dtype=torch.float64) for _ in range(2)]
     for engine in engines:
@@ -277,7 +277,7 @@ def test_resets_leave_no_trace() -> None:
 # Clients
 
 
-def test_dead_client_is_named() -> None:
+def test_a_dead_client_is_an_error_that_names_its_flock() -> None:
     engine = BulletPhysics(3, 2)
     bullet.disconnect(engine._clients[1])
     with pytest.raises(RuntimeError, match="flock 1"):
@@ -286,7 +286,7 @@ def test_dead_client_is_named() -> None:
         engine.reset(torch.tensor([1]), torch.zeros(1, 2, 3), torch.zeros(1, 2, 3))
 
 
-def test_closed_engine_says_so() -> None:
+def test_a_closed_engine_is_an_error() -> None:
     engine = BulletPhysics(2, 2)
     engine.close()
     engine.close()
@@ -294,7 +294,7 @@ def test_closed_engine_says_so() -> None:
         engine.step(torch.zeros(2, 2, 3))
 
 
-def test_engines_give_their_clients_back() -> None:
+def test_engines_free_their_clients() -> None:
     kept = BulletPhysics(1, 1)
     for _ in range(3):
         engine = BulletPhysics(2, 1)
@@ -306,7 +306,7 @@ def test_engines_give_their_clients_back() -> None:
     assert bullet.isConnected(kept._clients[0])
 
 
-def test_too_many_flocks_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_flocks_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     gc.collect()  # what other tests left
     first = BulletPhysics(2, 1)
     monkeypatch.setattr(module, "MAX_CLIENTS", most := max(first._clients) + 2)
@@ -317,7 +317,7 @@ def test_too_many_flocks_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     first.close()
 
 
-def test_terminal_stays_clean() -> None:
+def test_importing_pybullet_prints_nothing() -> None:
     script = "from modgnn_rl.envs.flocking.physics.bullet import BulletPhysics; BulletPhysics(1, 2)"
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")

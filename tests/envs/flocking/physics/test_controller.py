@@ -1,4 +1,4 @@
-"""The velocity controller against its equations written with matrices, its symmetries, and the limits of rotors."""
+"""The velocity controller against its equations in matrix form, its symmetries, and the limits of rotors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ALLOCATION = np.stack([np.ones(4), ROTORS[:, 1], -ROTORS[:, 0], DRAG * np.array(
 
 
 def saturate(wrench: np.ndarray) -> np.ndarray:
-    """The wrench [4, ...] that clipped rotors give."""
+    """The wrench [4, ...] of clipped rotors."""
     return ALLOCATION @ np.clip(np.linalg.solve(ALLOCATION, wrench), 0, MAX_ROTOR)
 
 
@@ -92,8 +92,8 @@ def test_constant_target_velocity_is_reached() -> None:
     assert float(engine.spin.abs().max()) < 1e-3
 
 
-def test_flights_commute_with_the_mirrors() -> None:
-    """The wanted yaw of 0 fixes the x axis, so mirrored targets give mirrored flights; with them half turns."""
+def test_trajectories_commute_with_mirrors() -> None:
+    """A desired yaw of 0 fixes the x axis, so mirrored targets give mirrored trajectories, and so do half turns."""
     signs = torch.tensor([[1.0, 1, 1], [-1, 1, 1], [1, -1, 1], [-1, -1, 1]], dtype=torch.float64).unsqueeze(1)
     engine = TorchPhysics(4, 6, dtype=torch.float64)
     for step in range(240):
@@ -103,7 +103,7 @@ def test_flights_commute_with_the_mirrors() -> None:
 
 
 def test_quarter_turns_hold_along_the_axes_and_nearly_elsewhere() -> None:
-    """Yaw 0 singles out x, so a quarter turn is a symmetry only where the flight needs no yaw."""
+    """Yaw 0 singles out x, so a quarter turn is a symmetry only for motion that needs no yaw."""
     engine = TorchPhysics(2, 4, dtype=torch.float64)
     target = torch.tensor([[1.0, 0, 0], [0, 1, 0.5], [-2, 0, 0], [0.6, 0.4, 0]], dtype=torch.float64)
     for _ in range(240):
@@ -149,7 +149,7 @@ def test_limits_are_those_of_single_rotors(wrench: tuple[float, ...]) -> None:
 
 @given(wrenches)
 def test_limits_have_the_symmetry_of_the_frame(wrench: tuple[float, ...]) -> None:
-    """A quarter turn swaps the rotors' senses of rotation, as a mirror does; a half turn does not."""
+    """A quarter turn swaps the rotors' directions of rotation, as a mirror does; a half turn does not."""
     thrust, roll, pitch, yaw = wrench
     limited, *torque = limit(np.array(wrench))
     a, b, c = torque

@@ -1,4 +1,4 @@
-"""Rigid bodies against PyBullet as an independent engine, against closed forms and against conservation laws."""
+"""Rigid bodies against PyBullet as an independent engine, closed forms and conservation laws."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def random_bodies(count: int, *, spin: float, seed: int = 0) -> Bodies:
 
 
 def level_body() -> Bodies:
-    """One body at rest in the origin."""
+    """One body at rest at the origin."""
     zero = torch.zeros(3, 1, dtype=torch.float64)
     return make_bodies(zero, torch.tensor([[0.0], [0], [0], [1]], dtype=torch.float64), zero, zero)
 
@@ -68,7 +68,7 @@ def angular_momentum(bodies: Bodies, quadcopter: Quadcopter) -> Tensor:
 
 
 def free(bodies: Bodies, time: float, dt: float, quadcopter: Quadcopter = CRAZYFLIE) -> Bodies:
-    """Move without thrust and torque."""
+    """Move without thrust or torque."""
     zero = torch.zeros_like(bodies.position[0])
     dynamics = Dynamics(period=dt, substeps=1, vehicle=quadcopter)
     return step_bodies(bodies, zero, (zero, zero, zero), dynamics, round(time / dt))
@@ -79,7 +79,7 @@ def free(bodies: Bodies, time: float, dt: float, quadcopter: Quadcopter = CRAZYF
 
 @pytest.mark.parametrize("quadcopter", [CRAZYFLIE, LOPSIDED])
 def test_tumbling_bodies_agree_with_bullet(quadcopter: Quadcopter) -> None:
-    """Wrenches that are given, in the world frame; for flights see test_bullet."""
+    """With given wrenches in the world frame; for controlled trajectories see test_bullet."""
     client = BulletClient(pb.DIRECT)
     client.setTimeStep(DT)
     client.setGravity(0, 0, -quadcopter.gravity)
@@ -141,7 +141,7 @@ def test_free_fall_keeps_the_energy_of_the_scheme() -> None:
     torch.testing.assert_close(conserved(free(start, 2, DT)), conserved(start), rtol=0, atol=1e-11)
 
 
-def test_hover_stays() -> None:
+def test_hover_is_a_fixed_point() -> None:
     start = level_body()
     end = step_bodies(start, torch.full((1,), HOVER, dtype=torch.float64), start.spin, Dynamics(), 1200)
     for before, after in zip(start, end, strict=True):
@@ -239,7 +239,7 @@ def random_targets(*shape: int, seed: int = 0, speed: float = 1.0) -> Tensor:
     return speed * torch.randn(*shape, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_flocks_and_agents_do_not_feel_each_other() -> None:
+def test_flocks_and_agents_do_not_influence_each_other() -> None:
     together, alone = TorchPhysics(3, 4, dtype=torch.float64), TorchPhysics(1, 1, dtype=torch.float64)
     position = random_targets(3, 4)
     together.reset(torch.arange(3), position, torch.zeros_like(position))
@@ -252,7 +252,7 @@ def test_flocks_and_agents_do_not_feel_each_other() -> None:
     torch.testing.assert_close(together.velocity[1, 2], alone.velocity[0, 0], rtol=0, atol=1e-12)
 
 
-def test_reset_puts_flocks_level_and_leaves_the_others() -> None:
+def test_reset_levels_some_flocks_and_leaves_the_others() -> None:
     engine = TorchPhysics(4, 2, dtype=torch.float64)
     for step in range(20):
         engine.step(random_targets(4, 2, seed=step, speed=3))
@@ -271,7 +271,7 @@ def test_reset_puts_flocks_level_and_leaves_the_others() -> None:
 
 
 def test_substeps_and_frequency_set_the_time_step() -> None:
-    """With thrust and gravity cut to one control period, a fall from rest shows dt and the number of substeps."""
+    """A fall from rest over one control period shows dt and the number of substeps."""
     engine = TorchPhysics(1, 1, Dynamics(period=0.1, substeps=4), dtype=torch.float64)
     velocity = torch.tensor([[[1.0, 0, 0]]], dtype=torch.float64)
     engine.reset(torch.arange(1), torch.zeros_like(velocity), velocity)
@@ -287,7 +287,7 @@ def test_substeps_and_frequency_set_the_time_step() -> None:
 # Options
 
 
-def test_damping_is_that_of_its_equation() -> None:
+def test_damping_equals_its_equation() -> None:
     """One step without thrust and torque: v (1 - d (1 + |v|) dt) - g dt; the same in the body frame for the rates."""
     start = random_bodies(6, spin=20)
     dynamics = Dynamics(linear_damping=0.3, angular_damping=0.7)
@@ -300,7 +300,7 @@ def test_damping_is_that_of_its_equation() -> None:
         torch.testing.assert_close(after, expected, rtol=0, atol=1e-13)
 
 
-def test_rotor_drag_is_that_of_its_equation() -> None:
+def test_rotor_drag_equals_its_equation() -> None:
     """Four rotors at hover, body velocity v: the force is -c_i v_i 4 omega along the body's axes."""
     bodies = random_bodies(6, spin=0)
     hover = torch.full((6,), CRAZYFLIE.hover_thrust, dtype=torch.float64)
@@ -332,7 +332,7 @@ def test_rotors_lag_exponentially() -> None:
 
 
 @pytest.mark.parametrize("changes", [{"motor_lag": 1e-9}, {"drag": 1e-12}, {"ground": -1e3}])
-def test_options_that_do_nothing_change_nothing(changes: dict[str, Any]) -> None:
+def test_neutral_options_change_nothing(changes: dict[str, Any]) -> None:
     plain, other = (TorchPhysics(1, 5, dynamics, dtype=torch.float64) for dynamics in (Dynamics(), Dynamics(**changes)))
     for step in range(96):
         for engine in (plain, other):
@@ -341,7 +341,7 @@ def test_options_that_do_nothing_change_nothing(changes: dict[str, Any]) -> None
 
 
 def test_push_is_an_acceleration() -> None:
-    """A push along z that balances gravity keeps a body without thrust where it is."""
+    """A push along z that balances gravity keeps an unpowered body in place."""
     engine = TorchPhysics(2, 3, Dynamics(vehicle=Quadcopter(thrust_to_weight=0.0)), dtype=torch.float64)
     push = torch.tensor([0.5, 0, CRAZYFLIE.gravity], dtype=torch.float64)
     for _ in range(48):
