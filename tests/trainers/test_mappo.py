@@ -13,7 +13,7 @@ import torch
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from modgnn_rl import load_policy
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
+from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.experiment.training import train
@@ -24,45 +24,44 @@ from modgnn_rl.trainers.loop.setup import initial_policy, resolve_model
 from modgnn_rl.trainers.mappo import kl_coef_of_round
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 
-WORLD = FlockingConfig(num_agents=4, max_steps=15)
+ENV = FlockingConfig(num_agents=4, max_steps=15)
 
 
-def _config(runs, *, env=WORLD, model=None, init_from=None, seed=0, name=None, **settings):
-    small = {"num_envs": 1, "rounds": 3, "steps_per_round": 8, "critic_warmup": 1, "epochs": 2, "num_minibatches": 2}
-    trainer = MAPPOConfig(**{**small, "critic_hidden": 8, "window": 3, **settings})
-    models = {} if model is None else {"model": model}
-    return TrainConfig(
-        env=env, trainer=trainer, runs=str(runs), init_from=init_from, seed=seed, name=name, threads=1, **models
+@pytest.fixture(scope="module")
+def mappo_config(small_config):
+    """Makes configurations of small runs of MAPPO with windows of a few steps."""
+    small = {"steps_per_round": 8, "critic_warmup": 1, "epochs": 2, "num_minibatches": 2, "window": 3}
+    return lambda runs, **settings: small_config(
+        runs, "mappo", **{**small, "env": ENV, "model": ModelConfig(), **settings}
     )
 
 
 @pytest.fixture(scope="module")
-def cloned(tmp_path_factory):
+def cloned(tmp_path_factory, small_config):
     """The run folder of a policy that was cloned a little."""
-    trainer = BCConfig(num_envs=1, batch_size=16, cloning_steps=20, cloning_updates=20, num_val_envs=1, ema_decay=0.5)
+    small = {"cloning_steps": 20, "cloning_updates": 20, "num_val_envs": 1, "ema_decay": 0.5}
     model = ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
-    runs = str(tmp_path_factory.mktemp("runs"))
-    return train(TrainConfig(env=WORLD, model=model, trainer=trainer, runs=runs, threads=1), evaluate=False)
+    return train(small_config(tmp_path_factory.mktemp("runs"), "bc", env=ENV, model=model, **small), evaluate=False)
 
 
 def _scores(policy):
-    rollouts = rollout(policy, WORLD, num_agents=4, num_flocks=3, steps=12, seed=5)
+    rollouts = rollout(policy, ENV, num_agents=4, num_flocks=3, steps=12, seed=5)
     return torch.cat((rollouts["error"], rollouts["reward"], rollouts["cohesion"]))
 
 
-def test_training_begins_with_exactly_the_policy_of_the_other_run(cloned, tmp_path):
-    config = resolve_model(_config(tmp_path, init_from=str(cloned.path)))
+def test_training_begins_with_exactly_the_policy_of_the_other_run(cloned, tmp_path, mappo_config):
+    config = resolve_model(mappo_config(tmp_path, init_from=str(cloned.path)))
     policy, expected = initial_policy(config), _scores(load_policy(cloned.path))
     assert config.model == ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
     assert torch.equal(_scores(policy), expected)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert torch.equal(_scores(GaussianActor(policy)), expected)
-    fresh = resolve_model(_config(tmp_path, model=ModelConfig(name="modgnn_mlp", hops=2, hidden=8)))
+    fresh = resolve_model(mappo_config(tmp_path, model=ModelConfig(name="modgnn_mlp", hops=2, hidden=8)))
     assert not torch.equal(_scores(initial_policy(fresh)), expected)
 
 
-def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_with(cloned, tmp_path):
-    run = train(_config(tmp_path, init_from=str(cloned.path), rounds=2, critic_warmup=2), evaluate=False)
+def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_with(cloned, tmp_path, mappo_config):
+    run = train(mappo_config(tmp_path, init_from=str(cloned.path), rounds=2, critic_warmup=2), evaluate=False)
     assert run.config["model"]["name"] == "modgnn_mlp"
     assert torch.equal(_scores(load_policy(run.path)), _scores(load_policy(cloned.path)))
 
@@ -74,19 +73,19 @@ def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_wit
         ModelConfig(name="mpnn", hidden=8, layers=2),
     ],
 )
-def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, model):
+def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, model, mappo_config):
     runs = []
     for number, seed in enumerate((1, 1, 2)):
         torch.manual_seed(number)
         before = torch.get_rng_state()
-        runs.append(train(_config(tmp_path, model=model, seed=seed, name=f"run{number}"), evaluate=False))
+        runs.append(train(mappo_config(tmp_path, model=model, seed=seed, name=f"run{number}"), evaluate=False))
         assert torch.equal(torch.get_rng_state(), before)
     metrics = [run.metrics_file.read_bytes() for run in runs]
     assert metrics[0] == metrics[1] != metrics[2]
 
 
-def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
-    run = train(_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15)), evaluate=False)
+def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path, mappo_config):
+    run = train(mappo_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15)), evaluate=False)
     checkpoint = load_checkpoint(run.checkpoints)
     of_learner = {"policy", "actor", "critic", "value_norm", "reference_policy", "optimizer", "generators"}
     of_flocks = {f"rollouts-{size}.{part}" for size in (3, 5) for part in ("env", "carried")}
@@ -101,9 +100,9 @@ def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path):
     assert all(torch.equal(value, weights[name]) for name, value in checkpoint.tensors["policy"].items())
 
 
-def test_each_size_has_metrics_of_its_own(cloned, tmp_path):
+def test_each_size_has_metrics_of_its_own(cloned, tmp_path, mappo_config):
     env, pull = FlockingConfig(num_agents=[3, 5], max_steps=15), {"kl_coef": 0.2, "kl_rounds": 4}
-    metrics = train(_config(tmp_path, env=env, init_from=str(cloned.path), **pull), evaluate=False).read_metrics()
+    metrics = train(mappo_config(tmp_path, env=env, init_from=str(cloned.path), **pull), evaluate=False).read_metrics()
     assert [line["step"] for line in metrics] == [1, 2, 3]
     common = ("reward", "cost/leader", "cost/effort", "error", "cohesion", "loss_critic", "kl_approx", "entropy")
     assert all({f"{size}/{name}" for size in (3, 5) for name in common} <= set(line) for line in metrics)
@@ -124,8 +123,8 @@ def test_each_size_has_metrics_of_its_own(cloned, tmp_path):
 @pytest.mark.parametrize(
     "model", [ModelConfig(name="pair_force", hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)]
 )
-def test_it_flies_in_every_world(tmp_path, env, model):
-    for line in train(_config(tmp_path, env=env, model=model), evaluate=False).read_metrics():
+def test_it_flies_in_every_world(tmp_path, env, model, mappo_config):
+    for line in train(mappo_config(tmp_path, env=env, model=model), evaluate=False).read_metrics():
         assert all(value == value for name, value in line.items() if "separation" not in name), line
 
 
@@ -142,10 +141,10 @@ def test_it_flies_in_every_world(tmp_path, env, model):
     ],
 )
 def test_a_beginning_that_cannot_be_is_refused_before_anything_is_created(
-    cloned, tmp_path, monkeypatch, change, message
+    cloned, tmp_path, monkeypatch, change, message, mappo_config
 ):
     monkeypatch.chdir(tmp_path)
-    config = _config(tmp_path / "runs", init_from=str(cloned.path))
+    config = mappo_config(tmp_path / "runs", init_from=str(cloned.path))
     for name, value in change.items():
         setattr(config, name, value)
     with pytest.raises(InputError, match=message):
@@ -162,9 +161,9 @@ def test_a_beginning_that_cannot_be_is_refused_before_anything_is_created(
         (BCConfig(cloning_steps=11, dart=True), "cloning_steps=11 is too short .* at least 12"),
     ],
 )
-def test_flights_that_hold_no_window_are_refused_before_anything_is_created(tmp_path, trainer, message):
+def test_flights_that_hold_no_window_are_refused_before_anything_is_created(tmp_path, trainer, message, mappo_config):
     """Learned messages of two layers are made anew from two steps before."""
-    config = _config(tmp_path / "runs", model=ModelConfig(name="mpnn", layers=2))
+    config = mappo_config(tmp_path / "runs", model=ModelConfig(name="mpnn", layers=2))
     config.trainer = trainer
     with pytest.raises(InputError, match=message):
         train(config)
@@ -179,18 +178,18 @@ def test_the_weight_of_the_kl_penalty_decays_linearly_after_the_warm_up():
     assert [kl_coef_of_round(constant, index) for index in (1, 2, 1000)] == [0.2] * 3
 
 
-def test_a_fresh_policy_has_no_kl_penalty(tmp_path):
-    metrics = train(_config(tmp_path, kl_coef=100.0), evaluate=False).read_metrics()
+def test_a_fresh_policy_has_no_kl_penalty(tmp_path, mappo_config):
+    metrics = train(mappo_config(tmp_path, kl_coef=100.0), evaluate=False).read_metrics()
     assert [line["kl_coef"] for line in metrics] == [0.0] * 3
     assert not any("4/loss_kl" in line for line in metrics)
 
 
-def test_callbacks_can_stop_it(tmp_path):
+def test_callbacks_can_stop_it(tmp_path, mappo_config):
     class Stop(Callback):
         def on_round(self, index, metrics):
             return index == 2
 
-    run = train(_config(tmp_path), callbacks=[Stop()], evaluate=False)
+    run = train(mappo_config(tmp_path), callbacks=[Stop()], evaluate=False)
     assert [line["step"] for line in run.read_metrics()] == [1, 2]
 
 
@@ -210,12 +209,12 @@ def test_the_command_trains_on(cloned, tmp_path):
     assert "modgnn_mlp" in json.loads((folder / "evaluation.json").read_text())["3"]["rows"]
 
 
-def test_from_scratch_the_reward_rises(tmp_path):
+def test_from_scratch_the_reward_rises(tmp_path, mappo_config):
     """Where only effort costs, the best action is the velocity that one has."""
     others = {f"{name}_cost": 0.0 for name in ("leader", "cohesion", "crowding", "collision", "alignment")}
     env = FlockingConfig(num_agents=3, max_steps=100, effort_cost=1.0, **others)
     rates = {"learning_rate": 1e-2, "critic_learning_rate": 1e-2, "gamma": 0.9}
     settings = {"rounds": 8, "steps_per_round": 16, "epochs": 4, "num_minibatches": 4}
-    run = train(_config(tmp_path, env=env, model=ModelConfig(name="gcn"), **rates, **settings), evaluate=False)
+    run = train(mappo_config(tmp_path, env=env, model=ModelConfig(name="gcn"), **rates, **settings), evaluate=False)
     rewards = [line["3/reward"] for line in run.read_metrics()]
     assert sum(rewards[-3:]) > 0.8 * sum(rewards[:3])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from modgnn_rl import load_policy, make_model
-from modgnn_rl.configs.schema import BCConfig, EvaluationConfig, FlockingConfig, ModelConfig, TrainConfig
+from modgnn_rl.configs.schema import BCConfig, EvaluationConfig, FlockingConfig, ModelConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import train
@@ -22,26 +22,14 @@ from modgnn_rl.trainers.imitation.learner import ImitationLearner, fit_together,
 from modgnn_rl.trainers.imitation.side_by_side import member_configs
 from modgnn_rl.trainers.loop.callbacks import Callback
 
-WORLD = FlockingConfig(num_agents=4, max_steps=30)
+ENV = FlockingConfig(num_agents=4, max_steps=30)
 
 
-def _config(runs, *, model=None, seed=0, **settings):
-    small = {
-        "num_envs": 1,
-        "batch_size": 8,
-        "cloning_steps": 12,
-        "cloning_updates": 20,
-        "num_val_envs": 2,
-        "ema_decay": 0.8,
-    }
-    return TrainConfig(
-        env=WORLD,
-        model=model or ModelConfig(name="pair_force", hidden=8),
-        trainer=BCConfig(**{**small, **settings}),
-        runs=str(runs),
-        seed=seed,
-        threads=1,
-    )
+@pytest.fixture
+def bc_config(small_config):
+    """Makes configurations of small runs of behaviour cloning."""
+    small = {"batch_size": 8, "cloning_steps": 12, "cloning_updates": 20, "ema_decay": 0.8}
+    return lambda runs, **settings: small_config(runs, "bc", **{**small, "env": ENV, **settings})
 
 
 def _equal(policy, other):
@@ -60,9 +48,9 @@ class _Trained(Callback):
         self.policies = policies
 
 
-def test_a_run_of_several_policies(tmp_path):
+def test_a_run_of_several_policies(tmp_path, bc_config):
     """Folders, names, metrics, and the rows of the evaluation."""
-    config, trained = _config(tmp_path, **SEVERAL, cloning_steps=8, num_val_envs=1), _Trained()
+    config, trained = bc_config(tmp_path, **SEVERAL, cloning_steps=8, num_val_envs=1), _Trained()
     run = train(dataclasses.replace(config, evaluation=EvaluationConfig(num_flocks=2, steps=4)), callbacks=[trained])
     assert sorted(path.name for path in run.path.iterdir() if (path / "config.yaml").exists()) == sorted(NAMES)
     rows = json.loads((run.path / "evaluation.json").read_text())["4"]["rows"]
@@ -89,19 +77,19 @@ def test_a_run_of_several_policies(tmp_path):
     assert _equal(load_policy(run.path), load_policy(run.path / NAMES[0]))
 
 
-def test_one_seed_fixes_a_run_of_several_policies(tmp_path):
+def test_one_seed_fixes_a_run_of_several_policies(tmp_path, bc_config):
     metrics = [
-        train(_config(tmp_path, **SEVERAL, cloning_updates=2), evaluate=False).metrics_file.read_bytes()
+        train(bc_config(tmp_path, **SEVERAL, cloning_updates=2), evaluate=False).metrics_file.read_bytes()
         for _ in range(2)
     ]
     assert metrics[0] == metrics[1]
 
 
-def test_a_policy_trained_beside_others_is_the_one_trained_alone(tmp_path):
+def test_a_policy_trained_beside_others_is_the_one_trained_alone(tmp_path, bc_config):
     """The first of several seeds draws; its data, weights and batches are those of a run of its own."""
     model = ModelConfig(name="mpnn", layers=2, hidden=8)
-    alone = train(_config(tmp_path, model=model), evaluate=False)
-    several = train(_config(tmp_path, model=model, seeds=2), evaluate=False)
+    alone = train(bc_config(tmp_path, model=model), evaluate=False)
+    several = train(bc_config(tmp_path, model=model, seeds=2), evaluate=False)
     mine, theirs = load_policy(several.path / "mpnn-K1-seed0"), load_policy(alone.path)
     for name, value in mine.state_dict().items():
         torch.testing.assert_close(value, theirs.state_dict()[name], rtol=1e-4, atol=1e-5)
@@ -109,18 +97,18 @@ def test_a_policy_trained_beside_others_is_the_one_trained_alone(tmp_path):
     assert losses[1]["mpnn-K1-seed0/4/validation_loss"] == pytest.approx(losses[0]["4/validation_loss"], rel=1e-3)
 
 
-def test_names_and_seeds_of_the_members():
-    members = member_configs(_config("runs", **SEVERAL))
+def test_names_and_seeds_of_the_members(bc_config):
+    members = member_configs(bc_config("runs", **SEVERAL))
     assert list(members) == NAMES
     assert members["gcn-K2-seed0"].model == ModelConfig(name="gcn", hops=2, hidden=8)
     assert members["gcn-K2-seed1"].seed == members["modgnn_mlp-K1-seed1"].seed != 0
-    assert list(member_configs(_config("runs"))) == ["pair_force"]
-    assert list(member_configs(_config("runs", models=["gcn"], hops=[3]))) == ["gcn"]
-    assert list(member_configs(_config("runs", models="gcn", hops=[1, 3]))) == ["gcn-K1", "gcn-K3"]
-    assert list(member_configs(_config("runs", seeds=2))) == ["pair_force-K1-seed0", "pair_force-K1-seed1"]
+    assert list(member_configs(bc_config("runs"))) == ["pair_force"]
+    assert list(member_configs(bc_config("runs", models=["gcn"], hops=[3]))) == ["gcn"]
+    assert list(member_configs(bc_config("runs", models="gcn", hops=[1, 3]))) == ["gcn-K1", "gcn-K3"]
+    assert list(member_configs(bc_config("runs", seeds=2))) == ["pair_force-K1-seed0", "pair_force-K1-seed1"]
 
 
-def test_members_are_trained_by_what_they_are_told_to(tmp_path):
+def test_members_are_trained_by_what_they_are_told_to(tmp_path, bc_config):
     class Start(Callback):
         def on_start(self, policies):
             self.policies = {
@@ -129,9 +117,9 @@ def test_members_are_trained_by_what_they_are_told_to(tmp_path):
             }
 
     start = Start()
-    train(_config(tmp_path, models=["gcn"], hops=[1, 2], cloning_updates=1), callbacks=[start], evaluate=False)
+    train(bc_config(tmp_path, models=["gcn"], hops=[1, 2], cloning_updates=1), callbacks=[start], evaluate=False)
     for hops in (1, 2):
-        fresh = member_configs(_config(tmp_path, models=["gcn"], hops=[1, 2]))[f"gcn-K{hops}"]
+        fresh = member_configs(bc_config(tmp_path, models=["gcn"], hops=[1, 2]))[f"gcn-K{hops}"]
         expected = trainer_module.make_learner(fresh, (1, 1)).ema_policy.state_dict()
         assert all(torch.equal(value, expected[key]) for key, value in start.policies[f"gcn-K{hops}"].items())
 
@@ -147,13 +135,13 @@ def test_members_are_trained_by_what_they_are_told_to(tmp_path):
         ),
     ],
 )
-def test_what_cannot_be_trained_is_refused_before_anything_is_created(tmp_path, settings, message):
+def test_what_cannot_be_trained_is_refused_before_anything_is_created(tmp_path, settings, message, bc_config):
     with pytest.raises(InputError, match=message):
-        train(_config(tmp_path / "runs", **settings))
+        train(bc_config(tmp_path / "runs", **settings))
     assert not list(tmp_path.iterdir())
 
 
-def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path, monkeypatch):
+def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path, monkeypatch, bc_config):
     flown, forward = [], ActionNoise.forward
 
     def watched(self, tensordict):
@@ -162,7 +150,7 @@ def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path
         return forward(self, tensordict)
 
     monkeypatch.setattr(ActionNoise, "forward", watched)
-    metrics = train(_config(tmp_path, dart=True, noise=0.1, cloning_updates=40), evaluate=False).read_metrics()
+    metrics = train(bc_config(tmp_path, dart=True, noise=0.1, cloning_updates=40), evaluate=False).read_metrics()
     # Tried out, and flown for validation, without noise; each part with the error of the round before it.
     after = [metrics[index]["4/validation_loss"] ** 0.5 for index in (9, 19, 29)]
     assert flown == pytest.approx([0.0, 0.1, 0.0, *after])
@@ -173,7 +161,7 @@ def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path
 
 @pytest.mark.parametrize("rounds", [2, 6])
 @pytest.mark.parametrize(("settings", "sets"), [({}, 1), ({"dart": True}, 4)])
-def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settings, sets, rounds):
+def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settings, sets, rounds, bc_config):
     seen, keep = [], FlockBuffer.keep
 
     def watched(self, rollouts):
@@ -181,7 +169,7 @@ def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settin
         seen.append((*rollouts.shape, self.seen))
 
     monkeypatch.setattr(FlockBuffer, "keep", watched)
-    train(_config(tmp_path, cloning_updates=rounds, stride=1, noise=0.2, **settings), evaluate=False)
+    train(bc_config(tmp_path, cloning_updates=rounds, stride=1, noise=0.2, **settings), evaluate=False)
     of_training = [entry for entry in seen if entry[0] == 8]
     assert len(of_training) == sets
     assert sum(steps for _, steps, _ in of_training) == 12
@@ -190,7 +178,7 @@ def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settin
 
 def _flights(policies, **settings):
     trainer = BCConfig(**{"num_envs": 1, "batch_size": 8, "ema_decay": 0.8, **settings})
-    flocks = FlockBuffer(WORLD, trainer, 6, 4, policies, Reynolds(), steps=12, hold_steps=12, seed=0)
+    flocks = FlockBuffer(ENV, trainer, 6, 4, policies, Reynolds(), steps=12, hold_steps=12, seed=0)
     flocks.keep(flocks.fly(1.0))
     return trainer, flocks.buffer
 
@@ -225,13 +213,13 @@ def test_fitting_together_is_fitting_each_alone_on_the_same_batches(models):
         assert together[number].learning_rate == alone.learning_rate
 
 
-def test_each_policy_has_its_folder_after_an_interruption_too(tmp_path):
+def test_each_policy_has_its_folder_after_an_interruption_too(tmp_path, bc_config):
     class Interrupt(Callback):
         def on_round(self, index, metrics):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(_config(tmp_path, models=["gcn", "modgnn_mlp"]), callbacks=[Interrupt()])
+        train(bc_config(tmp_path, models=["gcn", "modgnn_mlp"]), callbacks=[Interrupt()])
     (folder,) = tmp_path.iterdir()
     for name in ("gcn-K1", "modgnn_mlp-K1"):
         load_policy(folder / name)

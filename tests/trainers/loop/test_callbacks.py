@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -13,41 +11,15 @@ from tensordict.nn import TensorDictModule
 
 from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import (
-    BCConfig,
-    DAggerConfig,
     EvaluationConfig,
     FlockingConfig,
-    MAPPOConfig,
-    ModelConfig,
-    TrainConfig,
 )
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.trainers.loop.callbacks import Callback, StopOnPlateau
 
-SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 400}
-TRAINERS = {
-    "bc": BCConfig(**SMALL, cloning_steps=8, cloning_updates=4, num_val_envs=2),
-    "dagger": DAggerConfig(
-        **SMALL, cloning_steps=8, cloning_updates=2, rounds=3, steps_per_round=4, updates_per_round=2, num_val_envs=1
-    ),
-    "mappo": MAPPOConfig(
-        num_envs=1, rounds=3, steps_per_round=4, critic_warmup=0, epochs=1, num_minibatches=1, critic_hidden=8
-    ),
-}
 # Number of the rounds in which rollouts come in, and of all rounds.
 ROUNDS = {"bc": ([1], [1, 2, 3, 4]), "dagger": ([0, 0, 1, 2, 3], [0, 1, 2, 3]), "mappo": ([1, 2, 3], [1, 2, 3])}
-
-
-def _config(runs, trainer, **others):
-    return TrainConfig(
-        env=FlockingConfig(num_agents=4),
-        model=ModelConfig(name="pair_force", hidden=8),
-        trainer=trainer,
-        runs=str(runs),
-        threads=1,
-        **others,
-    )
 
 
 class _Watch(Callback):
@@ -73,10 +45,10 @@ class _Watch(Callback):
         self.ended = policies
 
 
-@pytest.mark.parametrize("name", TRAINERS)
-def test_the_four_places(tmp_path, name):
+@pytest.mark.parametrize("name", ROUNDS)
+def test_the_four_places(tmp_path, name, small_config):
     watch = _Watch()
-    run = train(_config(tmp_path, TRAINERS[name]), callbacks=[watch], evaluate=False)
+    run = train(small_config(tmp_path, name), callbacks=[watch], evaluate=False)
     kinds = {kind: [value for called, value in watch.calls if called == kind] for kind, _ in watch.calls}
     assert watch.calls[0] == ("start", ("pair_force",))
     assert watch.calls[-1] == ("end", ("pair_force",))
@@ -93,10 +65,10 @@ def test_the_four_places(tmp_path, name):
     assert all(torch.equal(value, weights[key]) for key, value in watch.ended["pair_force"].state_dict().items())
 
 
-@pytest.mark.parametrize("name", TRAINERS)
-def test_any_of_several_callbacks_stops_the_training_and_all_are_called(tmp_path, name):
+@pytest.mark.parametrize("name", ROUNDS)
+def test_any_of_several_callbacks_stops_the_training_and_all_are_called(tmp_path, name, small_config):
     watches = [_Watch(), _Watch(stop_at=2), _Watch()]
-    run = train(_config(tmp_path, TRAINERS[name]), callbacks=watches, evaluate=False)
+    run = train(small_config(tmp_path, name), callbacks=watches, evaluate=False)
     assert run.read_metrics()[-1]["step"] == 2
     assert [watch.calls for watch in watches[1:]] == [watches[0].calls] * 2
     assert ("end", ("pair_force",)) in watches[0].calls
@@ -104,26 +76,26 @@ def test_any_of_several_callbacks_stops_the_training_and_all_are_called(tmp_path
 
 
 @pytest.mark.parametrize("name", ["bc", "dagger"])
-def test_what_a_callback_changes_in_the_flights_is_learned_from(tmp_path, name):
+def test_what_a_callback_changes_in_the_flights_is_learned_from(tmp_path, name, small_config):
     class Zero(Callback):
         def on_collect(self, index, rollouts):
             rollouts["agents", "expert_action"].zero_()
 
     losses = []
     for callbacks in ([], [Zero()]):
-        run = train(_config(tmp_path, TRAINERS[name]), callbacks=callbacks, evaluate=False)
+        run = train(small_config(tmp_path, name), callbacks=callbacks, evaluate=False)
         losses.append(next(line["4/loss"] for line in run.read_metrics() if "4/loss" in line))
     assert losses[0] != losses[1]
 
 
-def test_a_callback_that_fails_ends_the_run_with_its_own_error(tmp_path):
+def test_a_callback_that_fails_ends_the_run_with_its_own_error(tmp_path, small_config):
     class Fail(_Watch):
         def on_round(self, index, metrics):
             raise RuntimeError("mine")
 
     watch = Fail()
     with pytest.raises(RuntimeError, match="mine"):
-        train(_config(tmp_path, TRAINERS["dagger"]), callbacks=[watch], evaluate=False)
+        train(small_config(tmp_path, "dagger"), callbacks=[watch], evaluate=False)
     assert "end" not in {kind for kind, _ in watch.calls}
 
 
@@ -159,8 +131,8 @@ def test_a_plateau_may_be_that_of_another_metric():
 
 
 @pytest.mark.parametrize("name", ["dagger", "mappo"])
-def test_the_error_of_a_round_is_the_mean_over_the_sizes(tmp_path, name):
-    config = dataclasses.replace(_config(tmp_path, TRAINERS[name]), env=FlockingConfig(num_agents=[3, 4]))
+def test_the_error_of_a_round_is_the_mean_over_the_sizes(tmp_path, name, small_config):
+    config = small_config(tmp_path, name, env=FlockingConfig(num_agents=[3, 4]))
     run = train(config, evaluate=False)
     for line in run.read_metrics():
         if line["step"] > 0:
@@ -169,29 +141,28 @@ def test_the_error_of_a_round_is_the_mean_over_the_sizes(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["bc", "dagger"])
-def test_an_expert_of_ones_own_is_learned_from_and_evaluated_against(tmp_path, name):
+def test_an_expert_of_ones_own_is_learned_from_and_evaluated_against(tmp_path, name, small_config):
     """It stands still; the trained policy does too, and its errors are against it."""
     still = TensorDictModule(
         lambda observation: 0.0 * observation[..., :3],
         in_keys=[("agents", "observation")],
         out_keys=[("agents", "expert_action")],
     )
-    shared = {"num_envs": 1, "batch_size": 64, "ema_decay": 0.5, "learning_rates": [1e-2, 1e-2, 1e-2]}
-    trainer = {
-        "bc": BCConfig(**shared, cloning_steps=20, cloning_updates=40, num_val_envs=2),
-        "dagger": DAggerConfig(
-            **shared,
-            cloning_steps=10,
-            cloning_updates=20,
-            rounds=3,
-            steps_per_round=5,
-            updates_per_round=20,
-            beta=0.0,
-            hold_steps=5,
-        ),
+    shared = {"batch_size": 64, "ema_decay": 0.5, "learning_rates": [1e-2, 1e-2, 1e-2]}
+    settings = {
+        "bc": {"cloning_steps": 20, "cloning_updates": 40},
+        "dagger": {
+            "cloning_steps": 10,
+            "cloning_updates": 20,
+            "steps_per_round": 5,
+            "updates_per_round": 20,
+            "num_val_envs": 8,
+            "beta": 0.0,
+            "hold_steps": 5,
+        },
     }[name]
     evaluation = EvaluationConfig(num_flocks=2, steps=4)
-    run = train(_config(tmp_path, trainer, evaluation=evaluation), expert=still)
+    run = train(small_config(tmp_path, name, **shared, **settings, evaluation=evaluation), expert=still)
     rows = json.loads((run.path / "evaluation.json").read_text())["4"]["rows"]
     assert rows["expert"]["error"]["mean"] == rows["zero action"]["error"]["mean"] == 0
     errors = [line["4/error"] for line in run.read_metrics() if "4/error" in line]
