@@ -11,13 +11,9 @@ import torch
 
 from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import (
-    BCConfig,
     CollectorConfig,
-    DAggerConfig,
     FlockingConfig,
-    MAPPOConfig,
     ModelConfig,
-    TrainConfig,
 )
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import resume, train
@@ -26,48 +22,63 @@ from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.utils.signals import Stopped
 
-SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "num_val_envs": 2, "checkpoint_minutes": 0}
-MAPPO: Any = {"num_envs": 2, "rounds": 5, "steps_per_round": 14, "critic_warmup": 1, "epochs": 1, "num_minibatches": 2}
-DAGGER: Any = {
-    **SMALL,
+IMITATION: dict[str, Any] = {"num_envs": 2, "capacity": 150, "num_val_envs": 2, "checkpoint_minutes": 0}
+BC: dict[str, Any] = {**IMITATION, "cloning_steps": 24, "cloning_updates": 6}
+DAGGER: dict[str, Any] = {
+    **IMITATION,
     "cloning_steps": 12,
     "cloning_updates": 6,
     "rounds": 4,
     "steps_per_round": 12,
     "updates_per_round": 4,
 }
-BC: Any = {**SMALL, "cloning_steps": 24, "cloning_updates": 6}
-RUNS: dict[str, dict[str, Any]] = {
-    "bc": {"trainer": BCConfig(**BC)},
-    "bc of several, with noise from the error": {
-        "trainer": BCConfig(**BC, dart=True, models=["gcn", "modgnn_mlp"], seeds=2)
-    },
-    "dagger": {"trainer": DAggerConfig(**DAGGER, beta_rounds=3)},
-    "dagger with a reservoir, stored messages, a plateau": {
-        "trainer": DAggerConfig(**{**DAGGER, "capacity": 40}, replacement="reservoir", plateau_rounds=1),
-        "model": ModelConfig(name="pair_force", hidden=8),
-    },
-    "dagger with an ensemble": {"trainer": DAggerConfig(**DAGGER, gate="ensemble", ensemble=2, gate_threshold=0.1)},
-    "dagger of two sizes in bad weather": {
-        "trainer": DAggerConfig(**DAGGER),
-        "env": FlockingConfig(
-            num_agents=[3, 5],
-            max_steps=15,
-            delay=2,
-            position_noise=0.01,
-            message_loss=0.1,
-            dropout_rate=0.3,
-            wind=0.2,
-            range_spread=0.2,
-            motor_lag=0.02,
-            leader="waypoints",
-        ),
-    },
-    "mappo": {"trainer": MAPPOConfig(**MAPPO, checkpoint_minutes=0, critic_hidden=8)},
-    "mappo with learned messages": {
-        "trainer": MAPPOConfig(**MAPPO, checkpoint_minutes=0, critic_hidden=8, window=3),
-        "model": ModelConfig(name="modgnn_mlp", layers=2, hidden=8),
-    },
+MAPPO: dict[str, Any] = {
+    "num_envs": 2,
+    "rounds": 5,
+    "steps_per_round": 14,
+    "critic_warmup": 1,
+    "num_minibatches": 2,
+    "checkpoint_minutes": 0,
+}
+# Trainer and settings.
+RUNS: dict[str, tuple[str, dict[str, Any]]] = {
+    "bc": ("bc", BC),
+    "bc of several policies with DART": ("bc", {**BC, "dart": True, "models": ["gcn", "modgnn_mlp"], "seeds": 2}),
+    "dagger": ("dagger", {**DAGGER, "beta_rounds": 3}),
+    "dagger with a reservoir, stored messages, a plateau": (
+        "dagger",
+        {
+            **DAGGER,
+            "capacity": 40,
+            "replacement": "reservoir",
+            "plateau_rounds": 1,
+            "model": ModelConfig(name="pair_force", hidden=8),
+        },
+    ),
+    "dagger with an ensemble": ("dagger", {**DAGGER, "gate": "ensemble", "ensemble": 2, "gate_threshold": 0.1}),
+    "dagger of two sizes with perturbations": (
+        "dagger",
+        {
+            **DAGGER,
+            "env": FlockingConfig(
+                num_agents=[3, 5],
+                max_steps=15,
+                delay=2,
+                position_noise=0.01,
+                message_loss=0.1,
+                dropout_rate=0.3,
+                wind=0.2,
+                range_spread=0.2,
+                motor_lag=0.02,
+                leader="waypoints",
+            ),
+        },
+    ),
+    "mappo": ("mappo", MAPPO),
+    "mappo with learned messages": (
+        "mappo",
+        {**MAPPO, "window": 3, "model": ModelConfig(name="modgnn_mlp", layers=2, hidden=8)},
+    ),
 }
 
 
@@ -78,24 +89,33 @@ class Signal(Callback):
         self.at, self.number = at, number
 
     def on_collect(self, index, rollouts):
-        """Send it."""
+        """Send the signal."""
         if index == self.at:
             self.at = None
             os.kill(os.getpid(), self.number)
 
 
-def _config(runs, **settings) -> TrainConfig:
-    settings = {"env": FlockingConfig(num_agents=4, max_steps=15), **settings}
-    return TrainConfig(**settings, runs=str(runs), threads=1)
+@pytest.fixture
+def config(small_config):
+    """Makes the configuration of a run with a checkpoint after every round."""
+    env = FlockingConfig(num_agents=4, max_steps=15)
+    return lambda runs, trainer, settings: small_config(
+        runs, trainer, **{"env": env, "model": ModelConfig(), **settings}
+    )
 
 
-def _stop(runs, at=2, number=signal.SIGTERM, **settings):
-    """A run that was stopped in a round."""
-    with pytest.raises(Stopped) as stopped:
-        train(_config(runs, **settings), callbacks=[Signal(at, number)], evaluate=False)
-    assert stopped.value.code == 128 + number
-    (folder,) = runs.iterdir()
-    return RunFolder.open(folder)
+@pytest.fixture
+def stopped_run(config):
+    """Makes a run that was stopped by a signal in one of its rounds."""
+
+    def make(runs, trainer, settings, at=2, number=signal.SIGTERM):
+        with pytest.raises(Stopped) as stopped:
+            train(config(runs, trainer, settings), callbacks=[Signal(at, number)], evaluate=False)
+        assert stopped.value.code == 128 + number
+        (folder,) = runs.iterdir()
+        return RunFolder.open(folder)
+
+    return make
 
 
 def _all_of(run):
@@ -123,10 +143,9 @@ QUICK = {"dagger with a reservoir, stored messages, a plateau", "mappo"}
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in RUNS]
 )
-def test_a_stopped_run_ends_as_one_that_was_not(tmp_path, name):
-    settings = RUNS[name]
-    straight = train(_config(tmp_path / "straight", **settings), evaluate=False)
-    run = _stop(tmp_path / "stopped", at=1 if name.startswith("bc") else 2, **settings)
+def test_a_stopped_run_ends_as_one_that_was_not(tmp_path, name, config, stopped_run):
+    straight = train(config(tmp_path / "straight", *RUNS[name]), evaluate=False)
+    run = stopped_run(tmp_path / "stopped", *RUNS[name], at=1 if name.startswith("bc") else 2)
     assert run.state == "stopped"
     resume(run.path, evaluate=False)
     assert run.state == "finished"
@@ -134,9 +153,9 @@ def test_a_stopped_run_ends_as_one_that_was_not(tmp_path, name):
 
 
 @pytest.mark.parametrize("how", ["another number of agents", "no data in checkpoints"])
-def test_flocks_or_data_that_begin_anew(tmp_path, capsys, how):
+def test_flocks_or_data_that_begin_anew(tmp_path, capsys, how, stopped_run):
     kept = how == "another number of agents"
-    run = _stop(tmp_path, trainer=DAggerConfig(**DAGGER, checkpoint_data=kept))
+    run = stopped_run(tmp_path, "dagger", {**DAGGER, "checkpoint_data": kept})
     before = load_policy(run.path).state_dict()
     resume(run.path, {"env.num_agents": [3, 5]} if kept else {}, evaluate=False)
     assert ("start afresh because of env.num_agents=[3, 5]" in capsys.readouterr().out) == kept
@@ -144,18 +163,18 @@ def test_flocks_or_data_that_begin_anew(tmp_path, capsys, how):
     assert any(not torch.equal(value, before[name]) for name, value in load_policy(run.path).state_dict().items())
 
 
-def test_what_cannot_change_is_named_and_nothing_is_touched(tmp_path):
-    run = _stop(tmp_path, trainer=DAggerConfig(**DAGGER))
+def test_what_cannot_change_is_named_and_nothing_is_touched(tmp_path, stopped_run):
+    run = stopped_run(tmp_path, "dagger", DAGGER)
     before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match=r"cannot change model\.hidden from 32 to 64"):
         resume(run.path, {"model.hidden": 64})
     assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == before
 
 
-def test_the_best_policy_is_kept_beside_the_last(tmp_path):
+def test_the_best_policy_is_kept_beside_the_last(tmp_path, config):
     better = {"bc": "validation_loss", "dagger": "error"}
     for name, metric in better.items():
-        run = train(_config(tmp_path / name, **RUNS[name]), evaluate=False)
+        run = train(config(tmp_path / name, *RUNS[name]), evaluate=False)
         records = [record[metric] for record in run.read_metrics() if record[metric] == record[metric]]
         found = load_checkpoint(run.best)
         assert set(found.tensors) == {"policy"}
@@ -166,9 +185,8 @@ def test_the_best_policy_is_kept_beside_the_last(tmp_path):
         load_policy(run.path, which="best")
 
 
-def test_a_run_that_fails_leaves_the_policies_of_before(tmp_path):
-    settings = RUNS["bc of several, with noise from the error"]
-    run = train(_config(tmp_path, **settings), evaluate=False)
+def test_a_run_that_fails_leaves_the_policies_of_before(tmp_path, config):
+    run = train(config(tmp_path, *RUNS["bc of several policies with DART"]), evaluate=False)
     before = {path: path.read_bytes() for path in run.path.glob("*/checkpoints/*/*")}
     assert len(before) >= 4 * 3  # of four policies
 
@@ -187,12 +205,13 @@ def test_a_run_that_fails_leaves_the_policies_of_before(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["process", "ray"])
-@pytest.mark.parametrize("name", ["dagger of two sizes in bad weather", "dagger with an ensemble", "mappo"])
-def test_a_stopped_run_of_workers_ends_as_one_that_was_not(tmp_path, name, kind):
+@pytest.mark.parametrize("name", ["dagger of two sizes with perturbations", "dagger with an ensemble", "mappo"])
+def test_a_stopped_run_of_workers_ends_as_one_that_was_not(tmp_path, name, kind, config, stopped_run):
     if kind == "ray":
         pytest.importorskip("ray")
-    settings = {**RUNS[name], "collector": CollectorConfig(kind, workers=2)}
-    straight = train(_config(tmp_path / "straight", **settings), evaluate=False)
-    run = _stop(tmp_path / "stopped", at=2, **settings)
+    trainer, settings = RUNS[name]
+    settings = {**settings, "collector": CollectorConfig(kind, workers=2)}
+    straight = train(config(tmp_path / "straight", trainer, settings), evaluate=False)
+    run = stopped_run(tmp_path / "stopped", trainer, settings)
     resume(run.path, evaluate=False)
     _assert_equal(_all_of(straight), _all_of(run))

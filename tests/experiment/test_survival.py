@@ -5,7 +5,6 @@ Run with ``pytest -m slow tests/experiment/test_survival.py``.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import multiprocessing
 import os
@@ -22,32 +21,45 @@ from typing import Any
 import pytest
 import torch
 
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, TrainConfig
+from modgnn_rl.configs.schema import FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint, save_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 
-SMALL: Any = {"num_envs": 1, "batch_size": 16, "capacity": 150, "num_val_envs": 2, "checkpoint_minutes": 0}
-TRAINERS: dict[str, Any] = {
-    "bc": BCConfig(**SMALL, cloning_steps=24, cloning_updates=30),
-    "dagger": DAggerConfig(
-        **SMALL, cloning_steps=12, cloning_updates=6, rounds=20, steps_per_round=12, updates_per_round=2, beta_rounds=3
-    ),
-    "mappo": MAPPOConfig(
-        num_envs=1, rounds=20, steps_per_round=8, critic_warmup=1, epochs=1, num_minibatches=2, checkpoint_minutes=0
-    ),
+IMITATION = {"capacity": 150, "num_val_envs": 2, "checkpoint_minutes": 0}
+SETTINGS: dict[str, dict[str, Any]] = {
+    "bc": {**IMITATION, "cloning_steps": 24, "cloning_updates": 30},
+    "dagger": {
+        **IMITATION,
+        "cloning_steps": 12,
+        "cloning_updates": 6,
+        "rounds": 20,
+        "steps_per_round": 12,
+        "beta_rounds": 3,
+    },
+    "mappo": {
+        "rounds": 20,
+        "steps_per_round": 8,
+        "critic_warmup": 1,
+        "num_minibatches": 2,
+        "critic_hidden": 64,
+        "checkpoint_minutes": 0,
+    },
 }
 MOMENTS = 20
 FILE_CALLS = {"open", "write", "close", "mkdir", "fsync", "replace", "rename", "rmdir", "unlink", "scandir", "lstat"}
 
 
-TRAINERS["short"] = dataclasses.replace(TRAINERS["dagger"], rounds=6)
+@pytest.fixture(scope="module")
+def config(small_config):
+    """Makes the configuration of a run with a checkpoint after every round."""
+    env = FlockingConfig(num_agents=4, max_steps=15)
 
+    def make(runs: Path, trainer: str, **settings: Any) -> TrainConfig:
+        return small_config(runs, trainer, **{"env": env, "model": ModelConfig(), **SETTINGS[trainer], **settings})
 
-def _config(runs: Path, trainer: str) -> TrainConfig:
-    env_config = FlockingConfig(num_agents=4, max_steps=15)
-    return TrainConfig(env=env_config, trainer=TRAINERS[trainer], runs=str(runs), threads=1)
+    return make
 
 
 def _start(function, *arguments, **options):
@@ -80,15 +92,15 @@ def _assert_equal(one, other):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trainer", ["bc", "dagger", "mappo"])
-def test_killed_at_random_moments(tmp_path, trainer):
+def test_killed_at_random_moments(tmp_path, trainer, config):
     began = time.monotonic()
-    straight = train(_config(tmp_path / "straight", trainer), evaluate=False)
+    straight = train(config(tmp_path / "straight", trainer), evaluate=False)
     duration = time.monotonic() - began
     moments = random.Random(0)
     ended = {"before its folder": 0, "before its first checkpoint": 0, "later": 0}
     for number in range(MOMENTS):
         runs = tmp_path / str(number)
-        process = _start(train, _config(runs, trainer), evaluate=False)
+        process = _start(train, config(runs, trainer), evaluate=False)
         time.sleep(moments.uniform(0.0, duration))
         process.kill()
         process.join()
@@ -141,11 +153,11 @@ def test_killed_at_every_call_that_touches_a_file_while_a_checkpoint_is_written(
     print(f"killed at {alive_for - 1} calls")
 
 
-def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path, finished):
+def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path, finished, config):
     def train_on_a_small_disk():
         warnings.simplefilter("default")
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # of a file; the checkpoints are larger
-        train(_config(tmp_path / "runs", "short"), evaluate=False)
+        train(config(tmp_path / "runs", "dagger", rounds=6), evaluate=False)
 
     process = _start(train_on_a_small_disk)
     process.join()
@@ -162,8 +174,8 @@ def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path, finished):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    return train(_config(tmp_path_factory.mktemp("finished"), "short"), evaluate=False)
+def finished(tmp_path_factory, config):
+    return train(config(tmp_path_factory.mktemp("finished"), "dagger", rounds=6), evaluate=False)
 
 
 def _damage(path: Path, how: str) -> None:
