@@ -15,7 +15,6 @@ from tensordict import TensorDict
 from modgnn_rl import load_policy
 from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import (
-    BCConfig,
     DAggerConfig,
     EnvOverrides,
     EvaluateConfig,
@@ -35,36 +34,22 @@ from modgnn_rl.trainers.loop import dashboard_callback
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.utils.device import prepare_torch
 
-SMALL = {"num_envs": 2, "batch_size": 16, "capacity": 400}
-
-
-def _config(runs, trainer, **others):
-    settings = {
-        "env": FlockingConfig(num_agents=5),
-        "evaluation": EvaluationConfig(num_flocks=3, steps=12),
-        "runs": str(runs),
-        "threads": 1,
-    }
-    return TrainConfig(trainer=trainer, **{**settings, **others})
-
-
-def _dagger(**settings):
-    small = {
-        "cloning_steps": 10,
-        "cloning_updates": 4,
-        "rounds": 3,
-        "steps_per_round": 5,
-        "updates_per_round": 2,
-        "num_val_envs": 1,
-    }
-    return DAggerConfig(**{**SMALL, **small, **settings})
+SMALL_EVALUATION = EvaluationConfig(num_flocks=3, steps=12)
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> RunFolder:
+def config(small_config):
+    """Makes the configuration of a small run with a small evaluation."""
+    small = {"num_envs": 2, "capacity": 400, "cloning_steps": 10, "cloning_updates": 4, "steps_per_round": 5}
+    small |= {"env": FlockingConfig(num_agents=5), "model": ModelConfig(), "evaluation": SMALL_EVALUATION}
+    return lambda runs, **settings: small_config(runs, "dagger", **{**small, **settings})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, config) -> RunFolder:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dashboard_callback, "STEPS", 8)  # of the reference rollouts
-        return train(_config(tmp_path_factory.mktemp("runs"), _dagger(), logger="csv"))
+        return train(config(tmp_path_factory.mktemp("runs"), logger="csv"))
 
 
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
@@ -137,26 +122,25 @@ def test_evaluation_in_another_world_has_files_of_its_own(run):
         evaluate_run(dataclasses.replace(config, env=EnvOverrides(max_links="many")))
 
 
-def test_one_seed_fixes_a_run(tmp_path):
+def test_one_seed_fixes_a_run(tmp_path, config):
     metrics = []
     for seed in (1, 1, 2):
-        run = train(_config(tmp_path, _dagger(), seed=seed, name=f"seed{seed}"))
+        run = train(config(tmp_path, seed=seed, name=f"seed{seed}"))
         metrics.append((run.metrics_file.read_bytes(), (run.path / "evaluation.json").read_bytes()))
     assert metrics[0] == metrics[1]
     assert metrics[0] != metrics[2]
 
 
-def test_behaviour_cloning_of_several_sizes(tmp_path):
-    trainer = BCConfig(**SMALL, cloning_steps=10, cloning_updates=40, num_val_envs=2)
-    env = FlockingConfig(num_agents=[3, 6])
-    run = train(_config(tmp_path, trainer, env=env, model=ModelConfig(name="modgnn_mlp", hops=2, hidden=8)))
+def test_behaviour_cloning_of_several_sizes(tmp_path, small_config):
+    env, model = FlockingConfig(num_agents=[3, 6]), ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
+    run = train(small_config(tmp_path, "bc", env=env, model=model, cloning_updates=40, evaluation=SMALL_EVALUATION))
     assert {"3/validation_loss", "6/validation_loss"} <= set(run.read_metrics()[-1])
     assert list(json.loads((run.path / "evaluation.json").read_text())) == ["3", "6"]
 
 
 @pytest.mark.slow  # about three minutes
 def test_dagger_learns_to_fly_better_than_the_local_expert(tmp_path):
-    run = train(_config(tmp_path, DAggerConfig(), env=FlockingConfig(), evaluation=EvaluationConfig()))
+    run = train(TrainConfig(trainer=DAggerConfig(), runs=str(tmp_path), threads=1))
     table = json.loads((run.path / "evaluation.json").read_text())["32"]["rows"]
     assert table["moment_force"]["error"]["mean"] < 0.09
     assert table["moment_force"]["error_minus_local"]["high"] < 0
@@ -252,7 +236,7 @@ runpy.run_module("modgnn_rl.{command}", run_name="__main__")
 
 
 @pytest.mark.parametrize("model", ["moment_force", "mpnn"])
-def test_training_goes_on_under_faults_and_learns_from_the_true_state(tmp_path, model):
+def test_training_goes_on_under_faults_and_learns_from_the_true_state(tmp_path, model, config):
     env_config = FlockingConfig(
         num_agents=[4, 6],
         message_loss=0.3,
@@ -269,9 +253,7 @@ def test_training_goes_on_under_faults_and_learns_from_the_true_state(tmp_path, 
         def on_collect(self, index, rollouts):
             seen.append(rollouts.select(("agents", "state"), ("agents", "mask"), ("agents", "expert_action")).clone())
 
-    run = train(
-        _config(tmp_path, _dagger(), env=env_config, model=ModelConfig(name=model)), callbacks=[DashboardCallback()]
-    )
+    run = train(config(tmp_path, env=env_config, model=ModelConfig(name=model)), callbacks=[DashboardCallback()])
     for rollouts in seen:
         agents = rollouts["agents"]
         label = Reynolds.for_env(env_config)(rollouts.exclude(("agents", "expert_action")))["agents", "expert_action"]

@@ -21,7 +21,7 @@ import torch
 import torch.distributed as dist
 
 from modgnn_rl import make_model
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig, TrainConfig
+from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError, NotFinite
 from modgnn_rl.experiment.training import resume, train
@@ -38,30 +38,27 @@ from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.trainers.ppo.learner import PPOLearner
 from modgnn_rl.utils.signals import Stopped
 
-WORLD = FlockingConfig(num_agents=4, max_steps=15)
-SMALL: Any = {"num_envs": 2, "batch_size": 16, "capacity": 150, "num_val_envs": 2, "checkpoint_minutes": 0}
-DAGGER: Any = {
-    **SMALL,
+ENV = FlockingConfig(num_agents=4, max_steps=15)
+IMITATION: dict[str, Any] = {"num_envs": 2, "capacity": 150, "num_val_envs": 2, "checkpoint_minutes": 0}
+DAGGER: dict[str, Any] = {
+    **IMITATION,
+    "batch_size": 16,
     "cloning_steps": 12,
     "cloning_updates": 4,
     "rounds": 3,
     "steps_per_round": 12,
     "updates_per_round": 3,
 }
+# By trainer.
 RUNS: dict[str, dict[str, Any]] = {
-    "bc": {"trainer": BCConfig(**SMALL, cloning_steps=24, cloning_updates=6, dart=True, models=["gcn", "pair_force"])},
-    "dagger": {"trainer": DAggerConfig(**DAGGER, beta_rounds=3)},
+    "bc": {**IMITATION, "cloning_steps": 24, "cloning_updates": 6, "dart": True, "models": ["gcn", "pair_force"]},
+    "dagger": {**DAGGER, "beta_rounds": 3},
     "mappo": {
-        "trainer": MAPPOConfig(
-            num_envs=2,
-            rounds=3,
-            steps_per_round=12,
-            critic_warmup=1,
-            epochs=1,
-            num_minibatches=2,
-            checkpoint_minutes=0,
-            critic_hidden=8,
-        ),
+        "num_envs": 2,
+        "steps_per_round": 12,
+        "critic_warmup": 1,
+        "num_minibatches": 2,
+        "checkpoint_minutes": 0,
         "model": ModelConfig(hidden=8),
     },
 }
@@ -119,7 +116,7 @@ def _assert_close(one, other):
 def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
     settings = DAggerConfig(batch_size=32, learning_rates=[1e-2, 1e-2, 1e-2])
     policy = make_model("modgnn_mlp", seed=0)
-    flocks = FlockBuffer(WORLD, settings, 8, 6, [policy], Reynolds(), steps=20, hold_steps=20, seed=0)
+    flocks = FlockBuffer(ENV, settings, 8, 6, [policy], Reynolds(), steps=20, hold_steps=20, seed=0)
     flocks.keep(flocks.fly(1.0))
     chance = torch.Generator().manual_seed(1)
     batches = [_double(flocks.buffer.sample()) for _ in range(4)]
@@ -146,7 +143,7 @@ def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
 def test_improving_on_parts_of_the_flights_is_improving_on_the_whole(tmp_path):
     settings = MAPPOConfig(num_minibatches=1, epochs=3, agents_per_state=100, critic_hidden=8, learning_rate=1e-2)
     actor = GaussianActor(make_model("moment_force", seed=0), 0.3)
-    group = FlockCollector(WORLD, 4, 4, (actor, Reynolds()), steps=10, seed=0)
+    group = FlockCollector(ENV, 4, 4, (actor, Reynolds()), steps=10, seed=0)
     rollouts = [_double(group.collect().clone()) for _ in range(2)]
     chance = torch.Generator().manual_seed(1)
     for each in rollouts:
@@ -154,7 +151,7 @@ def test_improving_on_parts_of_the_flights_is_improving_on_the_whole(tmp_path):
         each["agents", "controlled"] = controlled & (torch.rand(controlled.shape, generator=chance) < 0.6)
 
     def update():
-        learner = PPOLearner(make_model("moment_force", seed=0), settings, WORLD.state_key, seed=0)
+        learner = PPOLearner(make_model("moment_force", seed=0), settings, ENV.state_key, seed=0)
         for module in (learner.actor, learner.averaged, learner.reference_policy, learner.critic, learner.loss):
             module.double()
         for number, each in enumerate(rollouts):
@@ -170,7 +167,7 @@ def test_improving_on_parts_of_the_flights_is_improving_on_the_whole(tmp_path):
 def test_all_refuse_what_is_no_number_in_one_process(tmp_path):
     settings = DAggerConfig(on_nonfinite="skip")
     policy = make_model("gcn", seed=0)
-    flocks = FlockBuffer(WORLD, settings, 4, 6, [policy], Reynolds(), steps=20, hold_steps=20, seed=0)
+    flocks = FlockBuffer(ENV, settings, 4, 6, [policy], Reynolds(), steps=20, hold_steps=20, seed=0)
     flocks.keep(flocks.fly(1.0))
     batch = flocks.buffer.sample()
 
@@ -265,8 +262,8 @@ def _train(config, act=train, **spying):
 
 
 @pytest.mark.parametrize("name", ["dagger", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bc", "mappo"))])
-def test_a_run_of_two_processes(tmp_path, name):
-    config = TrainConfig(env=WORLD, **RUNS[name], runs=str(tmp_path / "runs"))
+def test_a_run_of_two_processes(tmp_path, name, small_config):
+    config = small_config(tmp_path / "runs", name, **{"env": ENV, "model": ModelConfig(), **RUNS[name]})
     (weights, starts, _), (others, elsewhere, _) = _in_two_processes(tmp_path, _train, config, as_torchrun=True)
     for one, other in zip(weights, others, strict=True):
         assert all(torch.equal(value, other[key]) for key, value in one.items())
@@ -284,8 +281,8 @@ def test_a_run_of_two_processes(tmp_path, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
-def test_a_signal_to_one_process_stops_all_and_the_run_goes_on(tmp_path, name):
-    config = TrainConfig(env=WORLD, **RUNS[name], runs=str(tmp_path / "runs"))
+def test_a_signal_to_one_process_stops_all_and_the_run_goes_on(tmp_path, name, small_config):
+    config = small_config(tmp_path / "runs", name, **{"env": ENV, "model": ModelConfig(), **RUNS[name]})
     spying = {"stop_at": 1, "stops": 1}
     results = _in_two_processes(tmp_path, lambda: _train(config, **spying), as_torchrun=True)
     assert [stopped for *_, stopped in results] == [143, 143]
