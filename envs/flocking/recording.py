@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.flocking.metrics import action_error
 from modgnn_rl.metrics import compute_metrics
 from modgnn_rl.registry import METRICS
 from modgnn_rl.visualization.recording import QUANTUM, Frame, MetricSeries, Recording, quantise, range_flips
@@ -66,43 +66,50 @@ class FlockRecorder:
     def __init__(self, config: FlockingConfig, stride: int = 1, flock: int = 0) -> None:
         self.config, self.stride, self.flock = config, stride, flock
         self.steps = 0
-        self._recorded: dict[str, list[Array]] = {
-            name: [] for name in ("position", "target_velocity", "present", "flips", "error")
-        }
+        plotted = [name for name, entry in METRICS.items() if entry.options.get("replay")]
+        positions_only = ("position",)
+        self._of_positions = [
+            name for name in plotted if METRICS[name].options.get("inputs", positions_only) == positions_only
+        ]
+        self._of_actions = [name for name in plotted if name not in self._of_positions]
+        self._recorded: dict[str, list[Array]] = defaultdict(list)
 
     def __call__(self, tensordict: TensorDictBase) -> None:
         """Record the state before a step, with the policy's and the expert's actions."""
         if self.steps % self.stride == 0:
             flock = tensordict[self.flock]
-            frame, agents = flock_frame(flock, self.config), flock["agents"]
+            frame = flock_frame(flock, self.config)
             quanta = quantise(frame.position)
+            quantities = {name: flock["agents", name] for name in ("action", "expert_action", "controlled")}
+            quantities["position"] = flock[self.config.state_key][..., :3]
+            metrics = compute_metrics(self._of_actions, self.config, quantities)
             step = {
                 "position": quanta,
                 "target_velocity": frame.target_velocity,
                 "present": frame.present,
                 "flips": range_flips(frame.edges, quanta, frame.present, self.config.comm_range),
-                "error": action_error(agents["action"], agents["expert_action"], agents["controlled"]).cpu().numpy(),
+                **{name: value.cpu().numpy() for name, value in metrics.items()},
             }
             for name, value in step.items():
                 self._recorded[name].append(value)
         self.steps += 1
 
     def recording(self) -> Recording:
-        """The recording so far; metrics other than the error are computed from the recorded positions."""
+        """The recording so far; metrics of positions are computed here, from the recorded ones."""
         position = np.stack(self._recorded["position"])
         metres = torch.from_numpy(position).double() * QUANTUM
-        plotted = {name: entry.options for name, entry in METRICS.items() if entry.options.get("replay")}
-        shape = compute_metrics([name for name in plotted if name != "error"], self.config, {"position": metres})
-        values = {name: value.reshape(len(value), -1).mean(-1).numpy() for name, value in shape.items()}
-        values["error"] = np.stack(self._recorded["error"])
+        metrics = compute_metrics(self._of_positions, self.config, {"position": metres})
+        values = {name: np.stack(self._recorded[name]) for name in self._of_actions}
+        values |= {name: value.reshape(len(value), -1).mean(-1).numpy() for name, value in metrics.items()}
         return Recording(
             position=position,
             target_velocity=np.stack(self._recorded["target_velocity"]),
             present=np.stack(self._recorded["present"]),
             flips=self._recorded["flips"],
             metrics={
-                name: MetricSeries(option["title"].capitalize(), option["unit"], values[name])
-                for name, option in plotted.items()
+                name: MetricSeries(entry.options["title"].capitalize(), entry.options["unit"], values[name])
+                for name, entry in METRICS.items()
+                if name in values
             },
             stride=self.stride,
             comm_range=self.config.comm_range,
