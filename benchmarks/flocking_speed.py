@@ -1,11 +1,11 @@
-"""Flock-steps a second of the flocking world, from the bare physics up to TorchRL's collector, and of its peers.
+"""Flock-steps per second of the flocking environment, from bare physics to TorchRL's collector, and of its peers.
 
     python benchmarks/flocking_speed.py                       # one thread, 32 agents, B = 1, 32, 256, 1,024
     python benchmarks/flocking_speed.py --threads 2 --envs 32 --agents 64
     python benchmarks/flocking_speed.py --peers               # PyBullet and VMAS too (VMAS: pip install vmas)
 
-Each row is the median over a few repetitions; a flock-step is one control step (five physics steps) of one flock.
-Compiled rows are measured after compiling.
+Each row is the median of a few repetitions. A flock-step is one control step (five physics steps) of one flock.
+Compiled rows are measured after compilation.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ Loop = Callable[[], int]
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--threads", type=int, default=1, help="threads of torch")
-    parser.add_argument("--agents", type=int, default=32, help="agents in a flock")
-    parser.add_argument("--envs", type=int, nargs="+", default=[1, 32, 256, 1024], help="flocks in a batch, B")
-    parser.add_argument("--seconds", type=float, default=1.5, help="length of one row")
-    parser.add_argument("--peers", action="store_true", help="measure PyBullet and VMAS too")
+    parser.add_argument("--threads", type=int, default=1, help="number of torch threads")
+    parser.add_argument("--agents", type=int, default=32, help="agents per flock")
+    parser.add_argument("--envs", type=int, nargs="+", default=[1, 32, 256, 1024], help="flocks per batch, B")
+    parser.add_argument("--seconds", type=float, default=1.5, help="duration of each measurement (s)")
+    parser.add_argument("--peers", action="store_true", help="also measure PyBullet and VMAS")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -76,68 +76,68 @@ def measure(envs: int, agents: int, seconds: float) -> dict[str, float]:
     for name in ("pair_force", "modgnn_mlp"):
         labelled = TensorDictSequential(make_model(name, seed=0), Reynolds())
         with torch.no_grad():
-            rates[f"Collector, {name} flies, expert labels, eager"] = rate(
+            rates[f"Collector, policy {name}, expert labels, eager"] = rate(
                 collect(envs, agents, labelled), envs, seconds
             )
     return rates
 
 
 def loops(envs: int, agents: int, compile: bool) -> Iterator[tuple[str, Loop]]:
-    """Yield the rows: a name, and a function that flies some steps and returns how many."""
+    """Yield the rows: a name, and a function that takes some steps and returns how many."""
     config = FlockingConfig(compile=compile)
     env = FlockingEnv(envs, agents, config=config, seed=0)
     env.reset()
-    # Actions that change, so that nothing is found ready.
+    # Actions change, so that no result can be reused.
     targets = [0.5 * torch.randn(envs, agents, 3) for _ in range(3)]
     turn = 0
 
-    def fly_physics() -> int:
+    def step_physics() -> int:
         nonlocal turn
         turn += 1
         env.physics.step(targets[turn % 3])
         return 1
 
-    yield "physics", fly_physics
+    yield "physics", step_physics
 
     expert = Reynolds.for_env(config)
 
-    def fly_world() -> int:
-        fly_physics()
+    def step_physics_and_graph() -> int:
+        step_physics()
         position, velocity = env.physics.position, env.physics.velocity
         env.communication_graph(position)
         expert.rule(position, velocity)
         return 1
 
-    yield "physics, adjacency, expert's label", fly_world
+    yield "physics, adjacency, expert's label", step_physics_and_graph
 
     start = env.reset()
 
-    def fly_environment() -> int:
+    def step_environment() -> int:
         nonlocal turn
         turn += 1
         start["agents", "action"] = targets[turn % 3]
         env.step(start)
         return 1
 
-    yield "env.step", fly_environment
+    yield "env.step", step_environment
 
-    pilot = Reynolds.for_env(config, action=("agents", "action"))
-    yield "env.rollout, the expert flies", roll_out(TransformedEnv(env, InitTracker()), pilot)
-    yield "Collector, the expert flies", collect(envs, agents, pilot, config)
+    expert_policy = Reynolds.for_env(config, action=("agents", "action"))
+    yield "env.rollout, expert", roll_out(TransformedEnv(env, InitTracker()), expert_policy)
+    yield "Collector, expert", collect(envs, agents, expert_policy, config)
 
 
 def roll_out(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> Loop:
-    """A function that flies ten steps with ``env.rollout``."""
+    """A function that takes ten steps with ``env.rollout``."""
 
-    def fly() -> int:
+    def step() -> int:
         env.rollout(10, policy, break_when_any_done=False)
         return 10
 
-    return fly
+    return step
 
 
 def collect(envs: int, agents: int, policy: TensorDictModuleBase, config: FlockingConfig | None = None) -> Loop:
-    """A function that flies ten steps with TorchRL's collector."""
+    """A function that takes ten steps with TorchRL's collector."""
     collector = Collector(
         FlockingEnv(envs, agents, config=config, seed=0),
         policy,
@@ -149,15 +149,15 @@ def collect(envs: int, agents: int, policy: TensorDictModuleBase, config: Flocki
     )
     batches = iter(collector)
 
-    def fly() -> int:
+    def step() -> int:
         next(batches)
         return 10
 
-    return fly
+    return step
 
 
 def peers(agents: int) -> Iterator[tuple[str, int, Loop]]:
-    """Yield other simulators: a name, its flocks, and a function that flies some steps and returns how many."""
+    """Yield other simulators: name, number of flocks, and a function that takes some steps and returns how many."""
     from modgnn_rl.envs.flocking.physics.bullet import BulletPhysics
 
     bullet = BulletPhysics(BULLET_FLOCKS, agents, Dynamics())
@@ -166,13 +166,13 @@ def peers(agents: int) -> Iterator[tuple[str, int, Loop]]:
     )
     target = 0.5 * torch.randn(BULLET_FLOCKS, agents, 3)
 
-    def fly_bullet() -> int:
+    def step_bullet() -> int:
         bullet.step(target)
         return 1
 
-    yield "PyBullet, physics alone", BULLET_FLOCKS, fly_bullet
+    yield "PyBullet, physics alone", BULLET_FLOCKS, step_bullet
     env = FlockingEnv(BULLET_FLOCKS, agents, physics="bullet", seed=0)
-    yield "PyBullet, env.rollout, the expert flies", BULLET_FLOCKS, roll_out(env, Reynolds(action=("agents", "action")))
+    yield "PyBullet, env.rollout, expert", BULLET_FLOCKS, roll_out(env, Reynolds(action=("agents", "action")))
     try:
         from torchrl.envs.libs.vmas import VmasEnv
 
@@ -183,12 +183,12 @@ def peers(agents: int) -> Iterator[tuple[str, int, Loop]]:
 
 
 def idle(env: EnvBase, data: TensorDictBase) -> TensorDictBase:
-    """Do nothing, at no cost."""
+    """Zero actions, at no cost."""
     return data.update(env.full_action_spec.zero())
 
 
 def rate(step: Loop, envs: int, seconds: float) -> float:
-    """Flock-steps a second: the median over the repetitions."""
+    """Flock-steps per second: the median of the repetitions."""
     for _ in range(2):
         step()
     rates = []

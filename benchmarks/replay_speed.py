@@ -1,4 +1,4 @@
-"""Frames a second of a replay in a headless Chromium that draws in software, at the pace of the rollout.
+"""Frames per second of a replay played in real time in a headless Chromium with software rendering.
 
 ``python benchmarks/replay_speed.py <replay.html> [<another.html> ...]``
 """
@@ -23,7 +23,7 @@ COUNT = f"""new Promise((done) => {{
 def main() -> None:
     """Print size and speed of each page, with two rollouts and with one."""
     if browser.CHROMIUM is None or not sys.argv[1:]:
-        sys.exit(f"{__doc__}\nIt takes a Chromium on the PATH.")
+        sys.exit(f"{__doc__}\nIt needs a Chromium on the PATH.")
     for page in map(Path, sys.argv[1:]):
         with browser.Browser(1280, 800) as window:
             window.open(page.resolve().as_uri())

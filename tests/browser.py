@@ -1,4 +1,4 @@
-"""A headless Chromium spoken to over a pipe by its DevTools protocol, without a package for it."""
+"""A headless Chromium, controlled through a pipe with its DevTools protocol, without a further package."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
-PATIENCE = 60.0  # s for one answer
+TIMEOUT = 60.0  # s for one answer
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run", "--disable-dev-shm-usage",
     "--disable-extensions", "--disable-background-networking", "--disable-component-update", "--disable-sync",
@@ -30,8 +30,8 @@ class Browser:
     Args:
         width: of the window, CSS pixels.
         height: of the window, CSS pixels.
-        dark: whether the reader prefers dark pages.
-        phone: whether it has a touch screen and two pixels to each CSS pixel.
+        dark: whether the user prefers dark pages.
+        phone: whether it has a touch screen and two pixels per CSS pixel.
     """
 
     def __init__(self, width: int = 1280, height: int = 900, *, dark: bool = False, phone: bool = False) -> None:
@@ -77,13 +77,13 @@ class Browser:
         self._stack.close()
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """Call a method of the protocol and return its result; events that come meanwhile are kept."""
+        """Call a method of the protocol and return its result; events received meanwhile are stored."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": params}
         if self._session is not None:
             message["sessionId"] = self._session
         os.write(self._out, json.dumps(message).encode() + b"\0")
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while True:
             answer = self._next(end)
             if answer.get("id") == self._number:
@@ -102,19 +102,19 @@ class Browser:
         return dict(json.loads(line))
 
     def open(self, url: str) -> None:
-        """Go to a page."""
+        """Navigate to a page."""
         self.call("Page.navigate", url=url)
         self.wait("document.readyState === 'complete'")
 
     def run(self, expression: str) -> Any:
-        """The value of an expression on the page; a promise is waited for."""
+        """Evaluate an expression on the page; promises are awaited."""
         result = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in result, result["exceptionDetails"]
         return result["result"].get("value")
 
     def wait(self, expression: str) -> None:
         """Wait until an expression is true."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while not self.run(expression):
             assert time.monotonic() < end, f"never true: {expression}"
             time.sleep(0.05)
@@ -126,7 +126,7 @@ class Browser:
         self.call("Input.dispatchKeyEvent", type="keyUp", key=key, **more)
 
     def place(self, selector: str, across: float = 0.5, down: float = 0.5) -> tuple[float, float]:
-        """Where an element is in the window, after scrolling to it."""
+        """Position of an element in the window, after scrolling to it."""
         x, y = self.run(
             f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
             "e.scrollIntoView({block: 'center'});"
@@ -150,7 +150,7 @@ class Browser:
         self.call(mouse, type="mouseReleased", x=x + by[0], y=y + by[1], button="left", clickCount=1)
 
     def touch(self, *paths: tuple[tuple[float, float], tuple[float, float]]) -> None:
-        """Put down a finger at the start of each path, move them to the ends, and lift them."""
+        """Touch the start of each path with a finger, move to the ends, and lift the fingers."""
         for kind, share in (("touchStart", 0.0), ("touchMove", 0.5), ("touchMove", 1.0)):
             points = [
                 {"x": start[0] + share * (end[0] - start[0]), "y": start[1] + share * (end[1] - start[1]), "id": finger}
@@ -165,5 +165,5 @@ class Browser:
         self.touch((point, point))
 
     def screenshot(self, path: str | os.PathLike[str]) -> None:
-        """Write a PNG of what the window shows."""
+        """Write a PNG of the window."""
         Path(path).write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
