@@ -1,9 +1,8 @@
-"""Writing the expert's rollouts to a dataset, shard by shard, so that a stopped collection can go on."""
+"""Collect expert episodes into a dataset, shard by shard; re-running resumes an unfinished dataset."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import math
 import os
@@ -16,32 +15,33 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock, Timeout
 from tensordict import TensorDict
 from torch import Tensor
 
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.data.dataset import WITHOUT_EFFECT
-from modgnn_rl.data.manifest import FILES, Manifest, check_shard, describe_files, num_bytes, recordable
+from modgnn_rl.data.manifest import LOCK, Manifest, check_shard, describe_shard, num_bytes, recordable
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.device import prepare_torch
-from modgnn_rl.utils.files import fsync_file, fsync_folder
+from modgnn_rl.utils.folders import write_folder
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["collect", "report", "rollout_expert"]
 
-MARGIN = 2**24  # bytes that stay free on the disk
-LEFTOVER = re.compile(r"shard_\d{5,}\.tmp|\.manifest\.json\.\d+\.tmp")  # of a process that was killed
+MARGIN = 2**24  # bytes to leave free on the disk
+LEFTOVER = re.compile(r"shard_\d{5,}\.(tmp|old)|\.manifest\.json\.\d+\.tmp")  # of a process that was killed
 
 
 def collect(config: CollectConfig) -> Path:
-    """Fly the expert and write a dataset, or what is missing of it; see `modgnn_rl.data.manifest` for its files.
+    """Roll out the expert and write a dataset, or its missing shards; see `modgnn_rl.data.manifest` for the files.
 
-    Each shard has a seed of its own and is written whole or not at all: whatever interrupts a collection, the same
-    settings later lead to the same dataset, bit for bit on the same machine.
+    Each shard has its own seed and is written atomically: after an interruption, the same settings lead to the same
+    dataset, bit for bit on the same machine.
 
     Returns:
         the folder.
@@ -65,7 +65,7 @@ def collect(config: CollectConfig) -> Path:
         missing = {name: shape for name, shape in wanted.shapes.items() if name not in wanted.shards}
         _check_space(folder, sum(map(num_bytes, missing.values())))
         if missing:
-            _fly_shards(folder, wanted, missing)
+            _collect_shards(folder, wanted, missing)
     except OSError as error:
         raise InputError(
             f"cannot write into {folder} ({error.strerror}): give output=<a folder that you can write to>"
@@ -79,7 +79,7 @@ def _kept_shards(folder: Path, wanted: Manifest) -> dict[str, dict[str, Any]]:
     Raises:
         InputError: the folder holds other things, or a dataset of other settings or more episodes.
     """
-    if not folder.exists() or all(map(LEFTOVER.fullmatch, os.listdir(folder))):
+    if not folder.exists() or all(name == LOCK or LEFTOVER.fullmatch(name) for name in os.listdir(folder)):
         return {}
     found = Manifest.read(folder)
     if different := found.differences(wanted.settings):
@@ -91,18 +91,18 @@ def _kept_shards(folder: Path, wanted: Manifest) -> dict[str, dict[str, Any]]:
         )
     kept = {}
     for name in found.shards.keys() & wanted.shapes.keys():
-        # A last shard that was shorter than the others is flown again with all episodes when more are wanted.
+        # A shorter last shard is collected again if more episodes are requested.
         if found.shapes[name] == wanted.shapes[name]:
             try:
                 check_shard(folder / name, found.shards[name], wanted.shapes[name], verify=True)
                 kept[name] = found.shards[name]
             except ValueError as error:
-                print(f"{folder / name} is damaged ({error}) and is flown again", file=sys.stderr)
+                print(f"{folder / name} is damaged ({error}) and is collected again", file=sys.stderr)
     return kept
 
 
 def _check_space(folder: Path, size: int) -> None:
-    """Refuse to begin what the disk has no room for.
+    """Refuse to start if the disk is too small.
 
     Raises:
         InputError: with the space needed and the space free.
@@ -111,14 +111,13 @@ def _check_space(folder: Path, size: int) -> None:
     free = shutil.disk_usage(there).free
     if size and free < size + MARGIN:
         raise InputError(
-            f"the rollouts take {size / 1e6:,.0f} MB and the disk of {folder} has {free / 1e6:,.0f} MB free; make "
-            f"room, "
-            "lower episodes or steps, or give output=<folder on another disk>"
+            f"the dataset takes {size / 1e6:,.0f} MB and the disk of {folder} has {free / 1e6:,.0f} MB free; free "
+            "some space, lower episodes or steps, or give output=<folder on another disk>"
         )
 
 
-def _fly_shards(folder: Path, manifest: Manifest, missing: dict[str, tuple[int, int, int, int]]) -> None:
-    """Fly the missing shards, by name their shapes, and note each in the manifest when it is safe on the disk."""
+def _collect_shards(folder: Path, manifest: Manifest, missing: dict[str, tuple[int, int, int, int]]) -> None:
+    """Collect the missing shards (shapes by name), and add each to the manifest once it is on disk."""
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder), Progress("collect", sum(shape[0] * shape[1] for shape in missing.values())) as progress:
         for name in filter(LEFTOVER.fullmatch, os.listdir(folder)):
@@ -134,13 +133,13 @@ def _fly_shards(folder: Path, manifest: Manifest, missing: dict[str, tuple[int, 
                 states = rollout_expert(env, steps, progress)
                 _check_space(folder, num_bytes(states.shape))
                 _write_shard(folder / name, states)
-                manifest.shards[name] = describe_files(folder / name)
+                manifest.shards[name] = describe_shard(folder / name)
                 manifest.write(folder)
                 progress.update(shards=f"{len(manifest.shards)}/{len(manifest.shapes)}")
         except KeyboardInterrupt:
             print(
-                f"Stopped; {folder} has {len(manifest.shards)} of {len(manifest.shapes)} shards, and the same command "
-                "goes on from there",
+                f"Stopped; {folder} has {len(manifest.shards)} of {len(manifest.shapes)} shards; re-running the "
+                "same command resumes there",
                 file=sys.stderr,
             )
             raise
@@ -148,27 +147,25 @@ def _fly_shards(folder: Path, manifest: Manifest, missing: dict[str, tuple[int, 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing a dataset; the system ends this with the process, however that ends.
+    """Keep other processes from writing into a dataset; the lock ends with the process.
 
     Raises:
         InputError: another process is writing it.
     """
-    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        guard = FileLock(folder / LOCK).acquire(timeout=0)
+    except Timeout as error:
+        raise InputError(f"another process is writing into {folder}; wait for it or stop it") from error
+    with guard:
         yield
-    except BlockingIOError as error:
-        raise InputError(f"another process is writing into {folder}; wait for it, or end it first") from error
-    finally:
-        os.close(descriptor)
 
 
 @torch.no_grad()
 def rollout_expert(env: FlockingEnv, steps: int, progress: Progress | None = None) -> Tensor:
-    """Fly the expert from fresh starts; nothing ends a rollout early.
+    """Roll out the expert from new initial states; no episode ends early.
 
     Args:
-        env: B flocks of N agents; their generators decide the rollouts.
+        env: B flocks of N agents; their generators determine the episodes.
         steps: steps T.
         progress: counts flock-steps.
 
@@ -180,7 +177,7 @@ def rollout_expert(env: FlockingEnv, steps: int, progress: Progress | None = Non
     tensordict = env.reset()
     for step in range(steps):
         states[:, step] = tensordict["agents", "observation"]
-        # A plain loop: only a reset, which does not happen here, would end a rollout.
+        # A plain loop: nothing resets the environment, so no episode ends.
         tensordict = env.step_mdp(env.step(expert(tensordict)))
         if progress is not None:
             progress.update(len(states))
@@ -188,20 +185,13 @@ def rollout_expert(env: FlockingEnv, steps: int, progress: Progress | None = Non
 
 
 def _write_shard(path: Path, states: Tensor) -> None:
-    """Write states [E, T, N, 6] as a memory-mapped TensorDict, whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
-    TensorDict({"state": states}, states.shape[:2]).memmap(temporary)
-    for file in FILES:
-        fsync_file(temporary / file)
-    fsync_folder(temporary)
-    if path.exists():  # damaged, or too short
-        shutil.rmtree(path)
-    os.replace(temporary, path)
-    fsync_folder(path.parent)
+    """Write states [E, T, N, 6] as a memory-mapped TensorDict, atomically."""
+    with write_folder(path) as temporary:
+        TensorDict({"state": states}, states.shape[:2]).memmap(temporary)
 
 
 def report(folder: Path) -> str:
-    """Where a dataset is, its size, and the command that trains on it."""
+    """Location and size of a dataset, and the command that trains on it."""
     manifest = Manifest.read(folder)
     size = sum(map(num_bytes, manifest.shapes.values()))
     default = {f"env.{name}": value for name, value in vars(FlockingConfig()).items() if name not in WITHOUT_EFFECT}

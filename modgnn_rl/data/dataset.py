@@ -24,7 +24,7 @@ from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 from torchrl.data.replay_buffers import Storage
 
 from modgnn_rl.configs.schema import FlockingConfig, as_list
-from modgnn_rl.data.manifest import MANIFEST, STATE, Manifest, check_shard
+from modgnn_rl.data.manifest import LOCK, MANIFEST, STATE, Manifest, check_shard
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.tensors import pair_distances
@@ -86,7 +86,7 @@ class EpisodeDataset:
                 f"{path} is not complete, it has {len(manifest.shards)} of {len(manifest.shapes)} shards; run the same "
                 "python -m modgnn_rl.collect again to complete it"
             )
-        if foreign := sorted(set(os.listdir(path)) - {MANIFEST, *manifest.shapes}):
+        if foreign := sorted(set(os.listdir(path)) - {MANIFEST, LOCK, *manifest.shapes}):
             raise InputError(f"{path / foreign[0]} does not belong to the dataset: move it elsewhere")
         shards = []
         for name, shape in manifest.shapes.items():

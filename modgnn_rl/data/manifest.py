@@ -1,4 +1,4 @@
-"""The manifest of a dataset of rollouts: what was flown, and what every file of it must be.
+"""The manifest of a dataset of expert episodes: settings, and a description of every file.
 
 One dataset is a folder::
 
@@ -26,45 +26,48 @@ from typing import Any
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
-from modgnn_rl.utils.files import sha256, write_atomically
+from modgnn_rl.utils.files import write_atomically
+from modgnn_rl.utils.folders import describe_files, verify_files
 
 __all__ = [
+    "DATASET_VERSION",
     "FILES",
+    "LOCK",
     "MANIFEST",
-    "SCHEMA_VERSION",
     "STATE",
     "Manifest",
     "check_shard",
-    "describe_files",
+    "describe_shard",
     "num_bytes",
     "recordable",
 ]
 
-SCHEMA_VERSION = 1
+DATASET_VERSION = 2  # 1: the environment's settings were under the key "world"
 MANIFEST = "manifest.json"
 STATE = "state.memmap"
+LOCK = ".lock"
 FILES = ("meta.json", STATE)  # of a shard
 PACKAGES = ("modgnn_rl", "torch", "torchrl", "tensordict")
-# Faults that are seen only through adjacency, observation and mask, which a dataset does not hold.
+# Perturbations that affect only adjacency, observation and mask, which a dataset does not contain.
 UNSEEN = ("message_loss", "delay", "range_spread", "position_noise", "velocity_noise", "dropout_rate")
 
-_DERIVED = ("schema_version", "complete", "num_agents")  # in the file for those who read it
+_DERIVED = ("schema_version", "complete", "num_agents")  # in the file for its readers
 
 _MALFORMED = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
 
 
 @dataclass
 class Manifest:
-    """What a dataset is made of; `read` and `write` keep it in ``manifest.json``.
+    """Description of a dataset; `read` and `write` keep it in ``manifest.json``.
 
     Attributes:
-        env_config: the world of the rollouts, all settings resolved.
-        seed: each shard was flown with the seed ``derive_seed(seed, name)``.
-        num_envs: episodes in each shard but the last, flown at once.
+        env_config: env config of the episodes.
+        seed: each shard was collected with the seed ``derive_seed(seed, name)``.
+        num_envs: episodes in each shard but the last, collected in parallel.
         steps: steps of an episode, T.
-        device: where they were flown.
+        device: device of the simulation.
         episodes: episodes of the complete dataset.
-        shards: for each shard that is there, by name, the SHA-256 and the size of its files, and what wrote them.
+        shards: by name of each finished shard, size and SHA-256 of its files, and versions of packages.
     """
 
     env_config: FlockingConfig
@@ -82,13 +85,13 @@ class Manifest:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All that decides what is in a shard, by the names of the command line."""
+        """Settings that determine the content of a shard, by their names on the command line."""
         env_config = {f"env.{name}": value for name, value in dataclasses.asdict(self.env_config).items()}
         del env_config["env.max_steps"]  # these are the steps
         return {**env_config, "seed": self.seed, "num_envs": self.num_envs, "steps": self.steps, "device": self.device}
 
     def differences(self, settings: Mapping[str, Any]) -> str:
-        """Which of these settings are others here, as ``name=value (there value)`` with commas between; or nothing."""
+        """The settings that differ, as ``name=value (there value)``, separated by commas; empty if none does."""
         ours = self.settings
         return ", ".join(
             f"{name}={value} (there {ours[name]})" for name, value in settings.items() if value != ours[name]
@@ -105,7 +108,7 @@ class Manifest:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all shards are there."""
+        """Whether all shards are finished."""
         return all(
             self.shards.get(name, {}).get("files", {}).get(STATE, {}).get("bytes") == num_bytes(shape)
             for name, shape in self.shapes.items()
@@ -116,30 +119,31 @@ class Manifest:
         """Read and verify the manifest of a dataset.
 
         Raises:
-            InputError: there is none, it was written by another version, or it is damaged.
+            InputError: it is missing, damaged, or of another version.
         """
         file = folder / MANIFEST
         if not file.is_file():
             raise InputError(
-                f"{folder} is no dataset of rollouts, it has no {MANIFEST}; python -m modgnn_rl.collect makes one"
+                f"{folder} is not a dataset of rollouts ({MANIFEST} is missing); python -m modgnn_rl.collect "
+                f"creates one"
             )
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
             found = content["schema_version"]
-            if found == SCHEMA_VERSION:
+            if found == DATASET_VERSION:
                 return cls._from_json(content)
         except _MALFORMED as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise InputError(f"{file} is damaged ({reason}): restore it from a copy or collect anew") from error
-        raise InputError(f"{file} has schema version {found}, this program reads {SCHEMA_VERSION}: collect anew")
+            raise InputError(f"{file} is damaged ({reason}): restore it from a copy or collect it again") from error
+        raise InputError(f"{file} has schema version {found}, this program reads {DATASET_VERSION}: collect it again")
 
     @classmethod
     def _from_json(cls, content: dict[str, Any]) -> Manifest:
         """The manifest in a parsed file, or one of `_MALFORMED`."""
         if content.pop("sha256") != _digest(content):
-            raise ValueError("it has changed since it was written, says its SHA-256")
+            raise ValueError("its content has changed since it was written (SHA-256)")
         known = {name: value for name, value in content.items() if name not in _DERIVED}
-        # JSON has no infinity; FlockingConfig has no setting that may be called so.
+        # JSON has no infinity; no setting has these strings as values.
         env_config: dict[str, Any]
         env_config = {
             name: float(value) if value in ("inf", "-inf") else value for name, value in known["env_config"].items()
@@ -152,12 +156,12 @@ class Manifest:
         return manifest
 
     def write(self, folder: Path) -> None:
-        """Write it whole or not at all.
+        """Write the file atomically.
 
         Raises:
             OSError: the folder cannot be written to.
         """
-        derived = {"schema_version": SCHEMA_VERSION, "complete": self.is_complete, "num_agents": self.num_agents}
+        derived = {"schema_version": DATASET_VERSION, "complete": self.is_complete, "num_agents": self.num_agents}
         content: dict[str, Any] = derived | {
             entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)
         }
@@ -174,18 +178,17 @@ def num_bytes(shape: tuple[int, ...]) -> int:
     return 4 * math.prod(shape)
 
 
-def describe_files(folder: Path) -> dict[str, Any]:
-    """What the manifest says of a shard that lies in ``folder``."""
-    files = {name: {"sha256": sha256(folder / name), "bytes": (folder / name).stat().st_size} for name in FILES}
-    return {"files": files, "packages": {name: _version(name) for name in PACKAGES}}
+def describe_shard(folder: Path) -> dict[str, Any]:
+    """The manifest's entry for a shard: its files, and the versions of the packages that wrote it."""
+    return {"files": describe_files(folder), "packages": {name: _version(name) for name in PACKAGES}}
 
 
 def check_shard(folder: Path, entry: Mapping[str, Any], shape: tuple[int, ...], *, verify: bool) -> None:
-    """Hold a shard against its entry in the manifest.
+    """Compare a shard with its entry in the manifest.
 
     Args:
         folder: the shard.
-        entry: what `describe_files` said when it was written.
+        entry: what `describe_shard` returned when it was written.
         shape: shape of its states.
         verify: read the files and compare their hashes, too.
 
@@ -198,14 +201,7 @@ def check_shard(folder: Path, entry: Mapping[str, Any], shape: tuple[int, ...], 
         raise ValueError("it is missing")
     if foreign := sorted(set(os.listdir(folder)) - set(FILES)):
         raise ValueError(f"{foreign[0]} does not belong there")
-    for name, expected in entry["files"].items():
-        file = folder / name
-        if not file.is_file():
-            raise ValueError(f"{name} is missing")
-        if (size := file.stat().st_size) != expected["bytes"]:
-            raise ValueError(f"{name} has {size} bytes instead of {expected['bytes']}")
-        if verify and sha256(file) != expected["sha256"]:
-            raise ValueError(f"{name} has changed since it was written, says its SHA-256")
+    verify_files(folder, entry["files"], hashes=verify)
 
 
 def _digest(content: Mapping[str, Any]) -> str:
@@ -220,21 +216,22 @@ def _version(package: str) -> str:
 
 
 def recordable(env_config: FlockingConfig, steps: int) -> FlockingConfig:
-    """The world of a dataset of rollouts of so many steps.
+    """The env config of a dataset of episodes with a number of steps.
 
     Raises:
-        InputError: a flock cannot be known from positions and velocities in this world.
+        InputError: the state of this environment is more than positions and velocities.
     """
     if len(env_config.sizes) > 1:
         raise InputError(
-            f"env.num_agents={env_config.sizes} are several sizes; a dataset has one, collect one for each"
+            f"env.num_agents={env_config.sizes} names several sizes; a dataset has one: collect one for each"
         )
     hidden = [f"env.{name}={getattr(env_config, name)}" for name in UNSEEN if getattr(env_config, name)]
     if env_config.graph != "matrix":
         hidden.append(f"env.graph={env_config.graph}")
     if hidden:
         raise InputError(
-            f"a dataset holds positions and velocities, which do not tell what agents see with {', '.join(hidden)}; "
+            f"a dataset contains positions and velocities, which do not determine the observations with "
+            f"{', '.join(hidden)}; "
             "leave it out, or train with trainer=dagger, which collects its own rollouts"
         )
     return dataclasses.replace(env_config, num_agents=env_config.sizes[0], max_steps=steps)

@@ -10,7 +10,6 @@ import io
 import json
 import logging
 import os
-import shutil
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -24,9 +23,9 @@ from torch import Tensor, nn
 from modgnn_rl.deploy.agent import EdgeData, check_local, edge_data, no_messages, own_data, step
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.utils.files import fsync_file, fsync_folder
+from modgnn_rl.utils.folders import write_folder
 
-__all__ = ["NEIGHBOURS", "TOLERANCE", "Exported", "check_packages", "export_agent", "write_folder"]
+__all__ = ["NEIGHBOURS", "TOLERANCE", "Exported", "check_packages", "export_agent", "write_agent"]
 
 NEIGHBOURS = (0, 1, 2, 7, 10, 40)  # numbers of neighbours for which the files are checked
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}  # of the larger of 1 and the largest entry
@@ -106,7 +105,7 @@ def export_agent(
         "agent.json": (json.dumps(metadata, indent=2) + "\n").encode(),
         RUNTIME.name: RUNTIME.read_bytes(),
     }
-    write_folder(folder, files)
+    write_agent(folder, files)
     return Exported(folder, metadata, difference)
 
 
@@ -235,11 +234,11 @@ def _difference(expected: Tensor, found: Tensor) -> float:
 
 
 def _metadata(policy: ModGNN, module: _Step, inputs: Inputs, models: Mapping[str, bytes]) -> dict[str, Any]:
-    from modgnn_rl.deploy.onnx_agent import SCHEMA_VERSION
+    from modgnn_rl.deploy.onnx_agent import EXPORT_VERSION
 
     action, messages = module(*inputs.values())
     return {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": EXPORT_VERSION,
         "layers": [layer.hops for layer in policy.layers],
         "hops": policy.hops,
         "message_width": messages.shape[-1],
@@ -261,34 +260,19 @@ def _check_folder(folder: Path) -> None:
         raise InputError(f"{folder} holds something that is no exported agent; give a folder that does not exist yet")
 
 
-def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write a folder of files whole or not at all; it takes the place of an older one.
+def write_agent(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write the files of an exported agent; an older export is replaced.
 
     Raises:
-        InputError: it cannot be written; an older folder is then unharmed.
+        InputError: the folder cannot be written; an older export is then unchanged.
     """
-    temporary, older = (folder.with_name(f".{folder.name}.{os.getpid()}.{name}") for name in ("tmp", "old"))
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary.mkdir()
-        for name, content in files.items():
-            (temporary / name).write_bytes(content)
-            fsync_file(temporary / name)
-        fsync_folder(temporary)
-        if folder.exists():
-            folder.rename(older)
-        try:
-            temporary.rename(folder)
-        except BaseException:
-            if older.exists():
-                older.rename(folder)
-            raise
-        fsync_folder(folder.parent)
+        with write_folder(folder) as temporary:
+            for name, content in files.items():
+                (temporary / name).write_bytes(content)
     except OSError as error:
         raise InputError(f"cannot write {folder} ({error.strerror}): choose a folder you can write to") from error
-    finally:
-        for rest in (temporary, older):
-            shutil.rmtree(rest, ignore_errors=True)
 
 
 @contextlib.contextmanager

@@ -24,9 +24,9 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["SCHEMA_VERSION", "AgentError", "OnnxAgent", "open_session"]
+__all__ = ["EXPORT_VERSION", "AgentError", "OnnxAgent", "open_session"]
 
-SCHEMA_VERSION = 1  # of agent.json
+EXPORT_VERSION = 1  # of agent.json
 
 Array = NDArray[Any]
 
@@ -178,8 +178,8 @@ def _load(folder: Path) -> tuple[dict[str, Any], bytes]:
         version, expected = metadata["schema_version"], metadata["files"][file.name]
     except (ValueError, KeyError, TypeError) as error:
         raise AgentError(f"{folder / 'agent.json'} is damaged; copy it again or export the policy again") from error
-    if version != SCHEMA_VERSION:
-        raise AgentError(f"{folder} was exported in version {version}, this program flies version {SCHEMA_VERSION}")
+    if version != EXPORT_VERSION:
+        raise AgentError(f"{folder} was exported in version {version}, this program flies version {EXPORT_VERSION}")
     if hashlib.sha256(model).hexdigest() != expected:
         raise AgentError(f"{file} is damaged: its SHA-256 is not the one in agent.json; copy it again or export again")
     return metadata, model

@@ -16,7 +16,7 @@ import yaml
 
 from modgnn_rl.metrics import higher_is_better
 from modgnn_rl.registry import METRICS
-from modgnn_rl.tracking.run_folder import SCHEMA_VERSION
+from modgnn_rl.tracking.run_folder import RUN_VERSION
 
 __all__ = [
     "as_dict",
@@ -48,8 +48,8 @@ def read_config(file: Path) -> dict[str, Any]:
     version = config.pop("schema_version", None) if isinstance(config, dict) else None
     if version is None:
         raise ValueError(f"{file.name} is not the configuration of a run")
-    if version != SCHEMA_VERSION:
-        raise ValueError(f"{file.name} has schema_version {version}, this program reads {SCHEMA_VERSION}")
+    if version != RUN_VERSION:
+        raise ValueError(f"{file.name} has schema_version {version}, this program reads {RUN_VERSION}")
     return {str(key): value for key, value in config.items()}
 
 

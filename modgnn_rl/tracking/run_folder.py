@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import math
 import os
@@ -26,9 +25,10 @@ from omegaconf.errors import OmegaConfBaseException
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.files import fsync_file, write_atomically
 
-__all__ = ["SCHEMA_VERSION", "RunFolder"]
+__all__ = ["RUN_VERSION", "RunFolder"]
 
-SCHEMA_VERSION = 1
+RUN_VERSION = 1
+LOCK_TIMEOUT = 0.5  # seconds; `is_locked` of another process holds the lock for a moment
 
 _HEADER = (
     "# The configuration of this run, all defaults written out. Commands that continue or evaluate the run read it.\n"
@@ -126,7 +126,7 @@ class RunFolder:
 
     def with_config(self, config_yaml: str) -> RunFolder:
         """Write ``config.yaml``, and return the folder as it is then."""
-        self.write("config.yaml", f"{_HEADER}schema_version: {SCHEMA_VERSION}\n{config_yaml}")
+        self.write("config.yaml", f"{_HEADER}schema_version: {RUN_VERSION}\n{config_yaml}")
         return self.open(self.path)
 
     @contextlib.contextmanager
@@ -138,7 +138,7 @@ class RunFolder:
         """
         lock = FileLock(self._lock_file)
         try:
-            lock.acquire(timeout=0)
+            lock.acquire(timeout=LOCK_TIMEOUT)
         except Timeout:
             raise InputError(
                 f"{self.path} is in use by a training run (process {self.status.get('pid', 'unknown')}): wait for it, "
@@ -161,19 +161,13 @@ class RunFolder:
 
     @property
     def is_locked(self) -> bool:
-        """Whether a process trains in this folder now; found without the right to write there."""
-        try:
-            descriptor = os.open(self._lock_file, os.O_RDONLY)
-        except FileNotFoundError:
+        """Whether a process is training in this folder; true if that is unknown, for lack of write permission."""
+        if not self._lock_file.exists():
             return False
-        except OSError:
-            return True  # unknown: believe what the status says
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # `lock` takes the exclusive one
-        except BlockingIOError:
+            FileLock(self._lock_file).acquire(timeout=0).lock.release()
+        except (Timeout, OSError):
             return True
-        finally:
-            os.close(descriptor)
         return False
 
     @property
@@ -310,8 +304,8 @@ def _read_config(file: Path) -> dict[str, Any]:
             f"{file} cannot be read as YAML ({reason}): restore it from a copy or use another run"
         ) from error
     version = config.pop("schema_version", None) if isinstance(config, dict) else None
-    if version != SCHEMA_VERSION or not isinstance(config, dict):
+    if version != RUN_VERSION or not isinstance(config, dict):
         raise InputError(
-            f"{file} has schema_version {version}, this program reads {SCHEMA_VERSION}: use the one that made the run"
+            f"{file} has schema_version {version}, this program reads {RUN_VERSION}: use the one that made the run"
         )
     return {str(key): value for key, value in config.items()}

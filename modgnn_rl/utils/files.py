@@ -42,8 +42,10 @@ def fsync_file(path: str | os.PathLike[str]) -> None:
         os.close(descriptor)
 
 
-# POSIX requires the same of a folder: a renamed file is safe once the folder itself is synchronised.
-fsync_folder = fsync_file
+def fsync_folder(path: str | os.PathLike[str]) -> None:
+    """Wait until the entries of a folder are on disk: POSIX requires it after a rename, Windows cannot do it."""
+    if os.name == "posix":
+        fsync_file(path)
 
 
 def sha256(path: str | os.PathLike[str]) -> str:

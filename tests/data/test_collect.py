@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import os
 import shutil
 import subprocess
@@ -14,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from filelock import FileLock
 from tensordict import TensorDict
 
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
@@ -21,9 +21,10 @@ from modgnn_rl.data import collect as collect_module
 from modgnn_rl.data import manifest
 from modgnn_rl.data.collect import collect, report, rollout_expert
 from modgnn_rl.data.dataset import EpisodeDataset
-from modgnn_rl.data.manifest import MANIFEST, STATE, Manifest
+from modgnn_rl.data.manifest import LOCK, MANIFEST, STATE, Manifest
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
+from modgnn_rl.utils import folders
 
 WORLD = FlockingConfig(num_agents=4)
 
@@ -57,9 +58,9 @@ class Killed(BaseException):
 
 STOPS: list[tuple[Any, str]] = [
     (collect_module, "rollout_expert"),
-    (collect_module, "fsync_file"),
+    (folders, "fsync_file"),
     (os, "replace"),
-    (collect_module, "describe_files"),
+    (collect_module, "describe_shard"),
     (manifest, "write_atomically"),
     (TensorDict, "memmap"),
 ]
@@ -114,7 +115,7 @@ def test_ctrl_c_says_how_far_it_got(
     monkeypatch.setattr(collect_module, "rollout_expert", interrupted)
     with pytest.raises(KeyboardInterrupt):
         collect(config(tmp_path / "set"))
-    assert "has 2 of 3 shards, and the same command goes on from there" in capsys.readouterr().err
+    assert "has 2 of 3 shards; re-running the same command resumes there" in capsys.readouterr().err
 
 
 def test_a_finished_dataset_is_not_touched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,7 +150,7 @@ def test_damaged_shards_are_flown_again(
     path = collect(config(tmp_path / "set"))
     damage(path)
     assert content(collect(config(path))) == whole
-    assert "and is flown again" in capsys.readouterr().err
+    assert "and is collected again" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -222,7 +223,7 @@ def test_nothing_ends_a_flight() -> None:
 
 def test_a_full_disk_is_refused_beforehand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 0, 5 * 10**6))
-    with pytest.raises(InputError, match=r"rollouts take 23,040 MB and the disk of .* has 5 MB free; make room"):
+    with pytest.raises(InputError, match=r"dataset takes 23,040 MB and the disk of .* has 5 MB free; free some space"):
         collect(config(tmp_path / "deep" / "set", episodes=30_000, steps=1000, env=FlockingConfig()))
     assert list(tmp_path.iterdir()) == []
 
@@ -237,19 +238,14 @@ def test_a_file_in_the_way_is_one_sentence(tmp_path: Path, name: str) -> None:
 
 def test_a_folder_of_other_things_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("mine")
-    with pytest.raises(InputError, match="no dataset of rollouts"):
+    with pytest.raises(InputError, match="not a dataset of rollouts"):
         collect(config(tmp_path))
     assert content(tmp_path) == {"mine": b"mine"}
 
 
 def test_two_processes_do_not_write_one_dataset(tmp_path: Path) -> None:
-    descriptor = os.open(tmp_path, os.O_RDONLY)
-    fcntl.flock(descriptor, fcntl.LOCK_EX)
-    try:
-        with pytest.raises(InputError, match="another process is writing"):
-            collect(config(tmp_path))
-    finally:
-        os.close(descriptor)
+    with FileLock(tmp_path / LOCK), pytest.raises(InputError, match="another process is writing"):
+        collect(config(tmp_path))
     collect(config(tmp_path))
 
 

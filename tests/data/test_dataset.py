@@ -22,7 +22,7 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
 from modgnn_rl.data.collect import collect
 from modgnn_rl.data.dataset import EpisodeDataset
-from modgnn_rl.data.manifest import MANIFEST, STATE
+from modgnn_rl.data.manifest import LOCK, MANIFEST, STATE
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
@@ -150,7 +150,7 @@ def test_episodes_that_do_not_exist_are_refused(folder: Path, episodes: range) -
 @given(data=st.data())
 def test_no_bit_can_change(folder: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     path = Path(shutil.copytree(folder, tmp_path_factory.mktemp("bits") / "set"))
-    file = data.draw(st.sampled_from(sorted(file for file in path.rglob("*") if file.is_file())))
+    file = data.draw(st.sampled_from(sorted(file for file in path.rglob("*") if file.is_file() and file.name != LOCK)))
     content = bytearray(file.read_bytes())
     bit = data.draw(st.integers(0, 8 * len(content) - 1))
     content[bit // 8] ^= 1 << bit % 8
@@ -192,11 +192,11 @@ def _edit(**changes: Any) -> Callable[[Path], None]:
         (lambda path: shutil.rmtree(path / "shard_00001"), "shard_00001 is damaged .it is missing.*run the same"),
         (lambda path: (path / "shard_00002" / STATE).unlink(), "shard_00002.*state.memmap is missing"),
         (lambda path: os.truncate(path / "shard_00000" / STATE, 400), "shard_00000.*has 400 bytes instead of 2592"),
-        (lambda path: (path / MANIFEST).unlink(), "no dataset of rollouts.*modgnn_rl.collect makes one"),
+        (lambda path: (path / MANIFEST).unlink(), "not a dataset of rollouts.*modgnn_rl.collect creates one"),
         (lambda path: (path / MANIFEST).write_text("[" * 100_000), "manifest.json is damaged"),
         (lambda path: (path / MANIFEST).write_text("null"), "manifest.json is damaged"),
         (lambda path: (path / MANIFEST).write_bytes(b"\xff\xfe"), "manifest.json is damaged"),
-        (_edit(schema_version=2), "has schema version 2, this program reads 1"),
+        (_edit(schema_version=1), "has schema version 1, this program reads 2"),
         (_edit(steps=1), "manifest.json is damaged .*changed since it was written"),
         (_plant("other.pickle"), "other.pickle does not belong to the dataset"),
         (_plant("shard_00003"), "shard_00003 does not belong to the dataset"),

@@ -35,6 +35,7 @@ from modgnn_rl.nn.communication import GraphAttention, MessagePassing
 from modgnn_rl.registry import MODELS
 from modgnn_rl.tracking.checkpoint import save_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
+from modgnn_rl.utils import folders
 
 ROOT = Path(__file__).parents[2]
 NEIGHBOURS = (3, 0, 1, 2, 7, 40, 5)
@@ -338,20 +339,20 @@ def test_a_folder_of_something_else_stays(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("broken", ["fsync_file", "fsync_folder"])
 def test_a_full_disk_leaves_the_older_export(broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    export.write_folder(tmp_path / "agent", {"agent.json": b"old", "agent.onnx": b"old"})
+    export.write_agent(tmp_path / "agent", {"agent.json": b"old", "agent.onnx": b"old"})
 
     def full(path: Path) -> None:
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(export, broken, full)
+        patch.setattr(folders, broken, full)
         with pytest.raises(InputError, match=r"cannot write .*No space left on device"):
-            export.write_folder(tmp_path / "agent", {"agent.json": b"new"})
+            export.write_agent(tmp_path / "agent", {"agent.json": b"new"})
     assert {file.name: file.read_bytes() for file in (tmp_path / "agent").iterdir()} == {
         "agent.json": b"old",
         "agent.onnx": b"old",
     }
-    export.write_folder(tmp_path / "agent", {"agent.json": b"new"})
+    export.write_agent(tmp_path / "agent", {"agent.json": b"new"})
     assert [file.read_bytes() for file in (tmp_path / "agent").iterdir()] == [b"new"]
     assert [folder.name for folder in tmp_path.iterdir()] == ["agent"]
 

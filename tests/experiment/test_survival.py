@@ -195,9 +195,9 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path, finished, how):
         folder = tmp_path / file.name
         shutil.copytree(finished.path, folder)
         _damage(folder / "checkpoints" / newest.name / file.name, how)
-        with pytest.warns(RuntimeWarning, match="CHECKPOINT PASSED OVER"):
+        with pytest.warns(RuntimeWarning, match="CHECKPOINT SKIPPED"):
             assert load_checkpoint(folder / "checkpoints").step == 6
-    with pytest.warns(RuntimeWarning, match="CHECKPOINT PASSED OVER"):
+    with pytest.warns(RuntimeWarning, match="CHECKPOINT SKIPPED"):
         run = resume(folder, evaluate=False)
     _assert_equal(straight, _contents(run))
     for file in run.checkpoints.glob("*/policy.safetensors"):

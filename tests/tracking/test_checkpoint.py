@@ -229,7 +229,7 @@ def damaged_forms(data):
         yield bytes(flipped)
 
 
-@pytest.mark.filterwarnings("ignore:CHECKPOINT PASSED OVER")
+@pytest.mark.filterwarnings("ignore:CHECKPOINT SKIPPED")
 @pytest.mark.parametrize("name", FILES)
 def test_every_cut_and_every_flipped_bit_is_noticed(tmp_path, name):
     save(tmp_path, 1)
@@ -248,14 +248,12 @@ def test_falling_back_is_loud(tmp_path):
     save(tmp_path, 1)
     file = save(tmp_path, 2) / "policy.safetensors"
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.warns(
-        RuntimeWarning, match=r"PASSED OVER.*step_000000002 \(policy.safetensors has \d+ bytes"
-    ) as caught:
+    with pytest.warns(RuntimeWarning, match=r"SKIPPED.*step_000000002 \(policy.safetensors has \d+ bytes") as caught:
         assert loaded_step(tmp_path) == 1
     assert len(caught) == 1
 
 
-@pytest.mark.filterwarnings("ignore:CHECKPOINT PASSED OVER")
+@pytest.mark.filterwarnings("ignore:CHECKPOINT SKIPPED")
 def test_all_damaged_is_refused_with_each_reason(tmp_path):
     (save(tmp_path, 1) / "state.json").write_text("{}")
     (save(tmp_path, 2) / "manifest.json").unlink()
@@ -277,7 +275,7 @@ def rewrite_manifest(path, **changes):
     (path / "manifest.json").write_text(json.dumps(manifest | changes))
 
 
-@pytest.mark.filterwarnings("ignore:CHECKPOINT PASSED OVER")
+@pytest.mark.filterwarnings("ignore:CHECKPOINT SKIPPED")
 @pytest.mark.parametrize("forged", [False, True], ids=["plain", "with its hash in the manifest"])
 @pytest.mark.parametrize("form", ["pickle", "torch"])
 @pytest.mark.parametrize("name", ["policy.safetensors", "state.json", "manifest.json"])
@@ -301,7 +299,7 @@ def test_a_pickle_is_refused_and_not_run(tmp_path, forged, form, name):
     assert not mark.exists()
 
 
-@pytest.mark.filterwarnings("ignore:CHECKPOINT PASSED OVER")
+@pytest.mark.filterwarnings("ignore:CHECKPOINT SKIPPED")
 @pytest.mark.parametrize(
     "changes",
     [
@@ -317,13 +315,13 @@ def test_a_manifest_of_another_kind_is_refused(tmp_path, changes):
         load_checkpoint(tmp_path)
 
 
-@pytest.mark.filterwarnings("ignore:CHECKPOINT PASSED OVER")
+@pytest.mark.filterwarnings("ignore:CHECKPOINT SKIPPED")
 def test_a_manifest_cannot_reach_outside_its_folder(tmp_path):
     path = save(tmp_path, 1)
     files = json.loads((path / "manifest.json").read_text())["files"]
     shutil.copy(path / "policy.safetensors", tmp_path / "secret.safetensors")
     rewrite_manifest(path, files=files | {"../secret.safetensors": files["policy.safetensors"]})
-    with pytest.raises(InputError, match="outside the checkpoint"):
+    with pytest.raises(InputError, match="outside the folder"):
         load_checkpoint(tmp_path)
 
 
