@@ -1,9 +1,9 @@
-"""How fast flocks fly in this process, in worker processes and on Ray.
+"""Speed of collecting rollouts in this process, in worker processes and on Ray.
 
     python benchmarks/collector_speed.py
 
-Rollouts of moment_force with the expert's labels, as a training run makes them; 32 flocks of 32 agents, two workers,
-one thread each. The collectors take turns; medians.
+Rollouts of moment_force with the expert's labels, as in a training run; 32 flocks of 32 agents, two workers with one
+thread each. The collectors run in turn; medians.
 """
 
 from __future__ import annotations
@@ -18,26 +18,24 @@ from importlib.metadata import version
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.local import FlockCollector
-from modgnn_rl.trainers.collectors.remote import RemoteCollector
+from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
+from modgnn_rl.trainers.collectors.remote import RemoteCollector, make_collector
 from modgnn_rl.utils.device import prepare_torch
 
 FLOCKS, AGENTS, STEPS, WORKERS = 32, 32, 40, 2
 REPETITIONS = 5
 
 
-def make(name: str, physics: str) -> FlockCollector | RemoteCollector:
-    """Flocks of one collector."""
-    flown = (make_model("moment_force", seed=0), Reynolds())
-    env_config = FlockingConfig(physics=physics)
-    if name == "single":
-        return FlockCollector(env_config, FLOCKS, AGENTS, flown, steps=STEPS, seed=0)
-    workers = CollectorConfig(name, workers=WORKERS)
-    return RemoteCollector(env_config, FLOCKS, AGENTS, flown, steps=STEPS, seed=0, collector=workers)
+def make(name: str, physics: str) -> LocalCollector | RemoteCollector:
+    """A collector by name."""
+    spec = RolloutSpec(training_env_factory(FlockingConfig(physics=physics)), FLOCKS, AGENTS, STEPS, seed=0)
+    behaviour = (make_model("moment_force", seed=0), Reynolds())
+    return make_collector(spec, behaviour, CollectorConfig(name, workers=WORKERS))
 
 
 def speeds(names: list[str], physics: str) -> dict[str, float]:
-    """Flock steps a second of each collector, all there at once, one flying at a time."""
+    """Flock steps per second of each collector; all exist at once, and one runs at a time."""
     collectors = {name: make(name, physics) for name in names}
     times: dict[str, list[float]] = {name: [] for name in names}
     try:

@@ -20,7 +20,9 @@ from torchrl.data import ReplayBuffer
 from modgnn_rl import ModGNN, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import FlockBuffer
+from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.trainers.collectors.local import RolloutSpec
+from modgnn_rl.trainers.collectors.rollout_buffer import make_buffer
 from modgnn_rl.trainers.imitation.learner import ImitationLearner
 from modgnn_rl.trainers.imitation.loss import imitation_loss, stacked_losses
 from modgnn_rl.utils.device import prepare_torch
@@ -50,12 +52,11 @@ def in_turns(runs: Mapping[str, Callable[[], object]]) -> dict[str, float]:
 
 def flown(policies: list[ModGNN], settings: DAggerConfig, num_agents: int = 32) -> ReplayBuffer:
     """Data for these policies."""
-    flocks = FlockBuffer(
-        FlockingConfig(), settings, 16, num_agents, policies, Reynolds(), steps=40, hold_steps=40, seed=0
-    )
-    flocks.keep(flocks.fly(beta=1.0))
-    flocks.close()
-    return flocks.buffer
+    spec = RolloutSpec(training_env_factory(FlockingConfig()), 16, num_agents, steps=40, seed=0)
+    data = make_buffer(spec, settings, policies, Reynolds(), hold_steps=40)
+    data.extend(data.collect(beta=1.0))
+    data.close()
+    return data.buffer
 
 
 def updates() -> None:

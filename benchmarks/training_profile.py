@@ -63,8 +63,8 @@ def watched() -> Clock:
     from modgnn_rl.envs import FlockingEnv
     from modgnn_rl.envs.flocking.expert import Reynolds
     from modgnn_rl.nn.modgnn import ModGNN
-    from modgnn_rl.trainers.collectors.flocks import FlockBuffer
-    from modgnn_rl.trainers.collectors.local import FlockCollector
+    from modgnn_rl.trainers.collectors.local import LocalCollector
+    from modgnn_rl.trainers.collectors.rollout_buffer import WindowBuffer
     from modgnn_rl.trainers.common.optimization import GuardedOptimizer
     from modgnn_rl.trainers.imitation import learner
     from modgnn_rl.trainers.loop.checkpointer import BestPolicies, Checkpointer
@@ -75,9 +75,9 @@ def watched() -> Clock:
     clock.watch(FlockingEnv, "_step", "environment: physics and graph")
     clock.watch(FlockingEnv, "_reset", "environment: physics and graph")
     clock.watch(Reynolds, "forward", "expert")
-    clock.watch(ModGNN, "forward", "policy, flying")
-    clock.watch(FlockCollector, "collect", "collector")
-    clock.watch(FlockBuffer, "keep", "data: windows into the buffer")
+    clock.watch(ModGNN, "forward", "policy, acting")
+    clock.watch(LocalCollector, "collect", "collector")
+    clock.watch(WindowBuffer, "extend", "data: windows into the buffer")
     clock.watch(ReplayBuffer, "sample", "batch assembly")
     clock.watch(learner.ImitationLearner, "prepare", "batch assembly")
     clock.watch(learner, "imitation_loss", "forward")

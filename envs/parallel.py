@@ -6,13 +6,9 @@ Workers end with their parent, however the parent ends; if a worker dies, the ot
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from multiprocessing import parent_process
-from threading import Thread
 from typing import Any
 
 import torch
@@ -24,6 +20,7 @@ from modgnn_rl.envs.flocking.env import FlockingEnv, checked_config
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.internals import parallel_env_processes
 from modgnn_rl.utils.seeds import derive_seed
+from modgnn_rl.utils.signals import follow_parent
 
 __all__ = ["ParallelFlocks", "make_worker_env", "parallel_flocks"]
 
@@ -134,14 +131,5 @@ def _end(workers: Sequence[Any]) -> None:
 
 def make_worker_env(**kwargs: Any) -> FlockingEnv:
     """Create the environment of a worker, in its process, which ignores Ctrl-C and ends with its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_parent, daemon=True).start()
+    follow_parent()
     return FlockingEnv(**kwargs)
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent ends, whatever it is doing."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

@@ -27,7 +27,7 @@ from torchrl.modules import get_primers_from_module
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.models.blocks import mlp
 from modgnn_rl.trainers.collectors.behaviour import BetaMixture
-from modgnn_rl.trainers.collectors.windows import as_windows
+from modgnn_rl.trainers.collectors.windows import slice_windows
 from modgnn_rl.trainers.imitation.loss import imitation_loss
 
 OBSERVATION, ACTION, EXPERT = ("robots", "observation"), ("robots", "action"), ("robots", "expert")
@@ -132,7 +132,7 @@ def main(
     for number, rollouts in enumerate(collector):
         mixture.share = 0.5 ** (number + 1)  # the expert's in the next round
         data = rollouts.select(*policy.in_keys, EXPERT, strict=False)
-        buffer.extend(as_windows(data, policy.window, stride=1))
+        buffer.extend(slice_windows(data, policy.window, stride=1))
         losses = []
         for _ in range(updates):
             loss = imitation_loss(policy, buffer.sample(), everybody, expert_action=EXPERT)

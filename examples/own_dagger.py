@@ -29,7 +29,7 @@ from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.envs.flocking.metrics import min_distance
 from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, SafetyGate, disagreement
-from modgnn_rl.trainers.collectors.windows import as_windows
+from modgnn_rl.trainers.collectors.windows import slice_windows
 from modgnn_rl.trainers.common.sampling import random_receivers
 from modgnn_rl.trainers.imitation.loss import imitation_loss
 
@@ -80,7 +80,7 @@ def main(
     errors: list[float] = []
     for rollouts in collector:
         # The last action of such a window is exact, whatever messages older weights have sent before it.
-        buffer.extend(as_windows(rollouts, policy.window, stride=2))
+        buffer.extend(slice_windows(rollouts, policy.window, stride=2))
         for _ in range(updates):
             batch = buffer.sample()
             receivers = random_receivers(batch["agents", "controlled"][:, -1], 8, generator)
@@ -90,7 +90,7 @@ def main(
             optimiser.step()
         test = rollout(policy, env_config, num_agents=num_agents, num_flocks=8, steps=test_steps, seed=1_000_000)
         errors.append(test["error"].mean().item())
-        expert_flew = rollouts["expert_flies"].float().mean().item()
+        expert_flew = rollouts["expert_acts"].float().mean().item()
         print(f"round {len(errors)}: the expert flew {expert_flew:4.0%}, then error {errors[-1]:.4f} m²/s²")
         mixture.beta = SCHEDULES[schedule](len(errors))
     return errors

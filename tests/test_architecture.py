@@ -82,7 +82,6 @@ INDEPENDENT = ("trainers", "evaluation", "tracking", "visualization")
 REMAINING = {
     "modgnn_rl.evaluation.recording",  # what is drawn of a flock
     "modgnn_rl.evaluation.rollout",  # the expert and the metrics of an episode
-    "modgnn_rl.trainers.collectors.local",  # the environment that is rolled out
     "modgnn_rl.trainers.loop.metrics",  # metrics of an episode, terms of the reward
     "modgnn_rl.trainers.loop.setup",  # checks that the environment can be built
 }

@@ -13,7 +13,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
-from modgnn_rl.trainers.collectors.windows import window_of
+from modgnn_rl.trainers.collectors.windows import window_length
 from modgnn_rl.trainers.imitation.demonstrations import DART_PARTS, make_demonstrations
 from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
 from modgnn_rl.trainers.imitation.side_by_side import by_policy, member_configs, member_folders
@@ -36,7 +36,7 @@ def check_bc(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDict
     check_updates(config, "cloning_updates")
     if settings.dataset is None:
         parts = DART_PARTS if settings.dart else 1
-        check_steps(config, "cloning_steps", parts * window_of(policies, settings))
+        check_steps(config, "cloning_steps", parts * window_length(policies, settings))
         return
     if expert is not None:
         raise InputError(
@@ -79,7 +79,7 @@ def bc(context: TrainContext) -> dict[str, ModGNN]:
     by_name = {name: make_learner(member, (total, total)) for name, member in members.items()}
     names, learners = list(by_name), list(by_name.values())
     policies = {name: learner.ema_policy for name, learner in by_name.items()}
-    data = make_demonstrations(config, list(policies.values()), context.expert, rounds)
+    data = make_demonstrations(context, list(policies.values()), rounds)
 
     with (
         member_folders(context.run, members, by_name),

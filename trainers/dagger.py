@@ -13,8 +13,8 @@ from modgnn_rl.configs.schema import DAggerConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
 from modgnn_rl.trainers.collectors.behaviour import SafetyGate, beta_schedule, disagreement, ensemble_std
-from modgnn_rl.trainers.collectors.flocks import make_buffers, make_validation_buffers
-from modgnn_rl.trainers.collectors.windows import window_of
+from modgnn_rl.trainers.collectors.rollout_buffer import make_buffers, make_validation_buffers
+from modgnn_rl.trainers.collectors.windows import window_length
 from modgnn_rl.trainers.imitation.demonstrations import collect_validation
 from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
 from modgnn_rl.trainers.loop.callbacks import StopOnPlateau
@@ -39,7 +39,7 @@ def check_dagger(config: TrainConfig, policies: Sequence[ModGNN], expert: Tensor
     """Refuse too few updates and rollouts that are too short."""
     check_updates(config, "cloning_updates")
     check_updates(config, "updates_per_round")
-    check_steps(config, "steps_per_round", window_of(policies, config.trainer))
+    check_steps(config, "steps_per_round", window_length(policies, config.trainer))
 
 
 @TRAINERS.register(
@@ -73,8 +73,8 @@ def dagger(context: TrainContext) -> dict[str, ModGNN]:
     policies, expert = [learner.ema_policy for learner in learners], context.expert
     options: dict[str, Any] = {"steps": settings.steps_per_round, "hold_steps": settings.hold_steps}
     gate = None if settings.gate == "none" else SafetyGate(GATES[settings.gate], settings.gate_threshold)
-    training = make_buffers(config, policies, expert, **options, gate=gate)
-    validation = make_validation_buffers(config, policies, expert, **options)
+    training = make_buffers(config, context.make_env, policies, expert, **options, gate=gate)
+    validation = make_validation_buffers(config, context.make_env, policies, expert, **options)
 
     by_name = dict(zip(names, learners, strict=True))
     with TrainingLoop(with_early_stopping(context), by_name, training, validation, total=total) as loop:
@@ -85,10 +85,10 @@ def dagger(context: TrainContext) -> dict[str, ModGNN]:
             collect_validation(validation, cloning_rollouts)
             for size, buffer in training.items():
                 for _ in range(repeats):
-                    rollouts = loop.on_collect(buffer.fly(beta))  # the expert labels every state
-                    buffer.keep(rollouts)  # aggregate
+                    rollouts = loop.on_collect(buffer.collect(beta))  # the expert labels every state
+                    buffer.extend(rollouts)  # aggregate
                 if index == 0:
-                    buffer.mixture.restart()
+                    buffer.collector.mixture.restart()
                 metrics |= rollout_metrics(rollouts, config.env)
                 metrics[f"{size}/loss"], *_ = fit_together(learners, buffer.buffer, steps)
                 metrics[f"{size}/validation_loss"], *_ = validate_together(learners, validation[size].buffer)

@@ -9,14 +9,13 @@ from tensordict.nn import TensorDictModuleBase
 from modgnn_rl.configs.schema import MAPPOConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
-from modgnn_rl.trainers.collectors.flocks import flocks_of
-from modgnn_rl.trainers.collectors.local import make_collector
+from modgnn_rl.trainers.collectors.remote import make_collector
+from modgnn_rl.trainers.collectors.rollout_buffer import training_spec
 from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.trainers.loop.metrics import mean_over_sizes, reward_metrics, rollout_metrics
 from modgnn_rl.trainers.loop.setup import check_steps, initial_policy
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 from modgnn_rl.trainers.ppo.learner import PPOLearner, ppo_window
-from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = ["kl_coef_of_round", "mappo"]
 
@@ -41,19 +40,9 @@ def mappo(context: TrainContext) -> dict[str, ModGNN]:
     """
     config, settings, sizes = context.config, context.config.trainer, context.config.env.sizes
     learner = PPOLearner(initial_policy(config), settings, config.env.state_key, config.seed)
-    collectors = {
-        size: make_collector(
-            config.collector,
-            config.env,
-            flocks_of(size, config),
-            size,
-            (learner.actor, context.expert),
-            steps=settings.steps_per_round,
-            seed=derive_seed(config.seed, "flocks", size),
-            device=config.device,
-        )
-        for size in sizes
-    }
+    specs = {size: training_spec(config, context.make_env, size, settings.steps_per_round) for size in sizes}
+    behaviour = (learner.actor, context.expert)
+    collectors = {size: make_collector(spec, behaviour, config.collector) for size, spec in specs.items()}
 
     name = config.model.name
     with TrainingLoop(context, {name: learner}, collectors, total=settings.rounds, unit="rounds") as loop:

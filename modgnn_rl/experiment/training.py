@@ -13,9 +13,10 @@ from typing import Any
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
-from modgnn_rl.configs.schema import TrainConfig
+from modgnn_rl.configs.schema import TrainConfig, as_list
 from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.expert import Reynolds
+from modgnn_rl.envs.flocking.task import training_env_factory
 from modgnn_rl.errors import one_line
 from modgnn_rl.experiment.evaluate import evaluate_policies
 from modgnn_rl.experiment.resume import changed_config, differences, requires_restart, stored_config
@@ -164,6 +165,7 @@ def _run(
         dashboards = [DashboardCallback(config, run, loggers, expert)] if loggers else []
         context = TrainContext(
             config=distributed.own_part(config, checkpoint.step if checkpoint else 0),
+            make_env=training_env_factory(config.env),
             expert=Reynolds.for_env(config.env) if expert is None else expert,
             run=run,
             loggers=loggers,
@@ -191,7 +193,8 @@ def _evaluate(
 ) -> None:
     """Evaluate the policies, and show the tables on dashboards."""
     run.note_status("evaluating")
-    tables = evaluate_policies(run, policies, config.env, config.evaluation, device, expert=expert)
+    sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
+    tables = evaluate_policies(run, policies, config.env, config.evaluation, sizes, device, expert=expert)
     log_evaluation(loggers, tables)
 
 

@@ -1,8 +1,9 @@
-"""Policies and settings of run folders."""
+"""Policies from run folders."""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -20,30 +21,23 @@ from modgnn_rl.tracking.run_folder import RunFolder
 __all__ = ["load_env_config", "load_policy", "override_env_config", "stored_model"]
 
 
-def load_policy(
-    run: RunFolder | str | os.PathLike[str],
-    *,
-    device: torch.device | str = "cpu",
-    which: str = "last",
-    env_config: FlockingConfig | None = None,
-) -> ModGNN:
-    """Load the policy of a run.
+def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", which: str = "last") -> ModGNN:
+    """Load the policy that a run ended with, or reached so far.
 
     Args:
-        run: a run folder, or its path ``runs/<date>-<name>``.
-        device: device of the policy.
-        which: ``last``: the latest; or ``best``: the one with the best score in training.
-        env_config: environment config of the run, if it is loaded already.
+        folder: a run folder, ``runs/<date>-<name>``.
+        device: where the policy goes.
+        which: ``last``, or ``best``: the one with the best score while it trained.
 
     Returns:
         the policy, a TensorDictModule for flocks of any size, in evaluation mode.
 
     Raises:
-        InputError: not a run folder, no readable checkpoint, or a checkpoint of another model.
+        InputError: the folder holds no run, no readable checkpoint, or one of another model.
     """
-    run = run if isinstance(run, RunFolder) else RunFolder.open(run)
+    run = RunFolder.open(Path(folder))
     model = stored_model(run)
-    policy = configured_model(model, env_config or load_env_config(run), seed=0)
+    policy = configured_model(model, load_env_config(run), seed=0)
     checkpoint = load_checkpoint(run.best if which == "best" else run.checkpoints, groups=("policy",))
     try:
         policy.load_state_dict(checkpoint.tensors["policy"])
@@ -56,44 +50,44 @@ def load_policy(
 
 
 def stored_model(run: RunFolder) -> ModelConfig:
-    """The model settings of a run.
+    """The model that a run trained.
 
     Raises:
-        InputError: its configuration is damaged.
+        InputError: its configuration does not describe one.
     """
     model: ModelConfig = _stored(run, "model", ModelConfig)
     return model
 
 
 def load_env_config(run: RunFolder) -> FlockingConfig:
-    """The environment config of a run.
+    """The world that a run was trained in.
 
     Raises:
-        InputError: its configuration is damaged.
+        InputError: its configuration does not describe one.
     """
     env_config: FlockingConfig = _stored(run, "env", FlockingConfig)
     return env_config
 
 
-def override_env_config(env_config: FlockingConfig, overrides: Any) -> tuple[FlockingConfig, dict[str, Any]]:
-    """Change some settings of an environment.
+def override_env_config(run: RunFolder, changes: Any) -> tuple[FlockingConfig, dict[str, Any]]:
+    """The world that a run was trained in, with some settings changed.
 
     Args:
-        env_config: environment config, such as that of a run.
-        overrides: a `modgnn_rl.configs.schema.EnvOverrides`; its settings that are None stay as they are.
+        run: the run.
+        changes: a `modgnn_rl.configs.schema.EnvOverrides`.
 
     Returns:
-        the changed environment config, and by name the settings that it changes.
+        the world, and by name the settings that are changed.
 
     Raises:
         InputError: a value of the wrong kind.
     """
-    changed = {name: value for name, value in vars(overrides).items() if value is not None}
+    changed = {name: value for name, value in vars(changes).items() if value is not None}
     try:
-        found: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(env_config), changed))
+        env_config: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(load_env_config(run)), changed))
     except OmegaConfBaseException as error:
         raise InputError(f"env.{error.full_key}: {str(error.msg).splitlines()[0]}") from error
-    return found, changed
+    return env_config, changed
 
 
 def _stored(run: RunFolder, group: str, schema: type) -> Any:

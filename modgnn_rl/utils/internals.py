@@ -11,9 +11,18 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tensordict import TensorDictBase
     from torch import nn
+    from torchrl.collectors import Collector
 
-__all__ = ["has_hooks", "is_functorch_active", "parallel_env_processes", "parse_hydra_flags"]
+__all__ = [
+    "collector_carrier",
+    "has_hooks",
+    "is_functorch_active",
+    "parallel_env_processes",
+    "parse_hydra_flags",
+    "set_collector_carrier",
+]
 
 
 def parse_hydra_flags(arguments: Sequence[str]) -> argparse.Namespace:
@@ -63,3 +72,18 @@ def is_functorch_active() -> bool:
     import torch
 
     return torch._C._functorch.maybe_current_level() is not None
+
+
+def collector_carrier(collector: Collector) -> TensorDictBase:
+    """The data that TorchRL's `Collector` carries from one step to the next [B], such as observations and messages.
+
+    A checkpoint needs them, so that rollouts resume where they were. TorchRL's ``state_dict`` of a collector holds the
+    states of environment and policy only.
+    """
+    carrier: TensorDictBase = collector._carrier
+    return carrier
+
+
+def set_collector_carrier(collector: Collector, carrier: TensorDictBase) -> None:
+    """Replace the data that a `Collector` carries to the next step [B]; see `collector_carrier`."""
+    collector._carrier = carrier

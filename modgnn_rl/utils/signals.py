@@ -7,9 +7,10 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from multiprocessing import parent_process
 from types import FrameType
 
-__all__ = ["GracefulInterrupt", "Stopped"]
+__all__ = ["GracefulInterrupt", "Stopped", "follow_parent"]
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -94,3 +95,17 @@ class GracefulInterrupt:
             raise Stopped(number)
         if self._advice:
             os.write(2, f"\n{self._advice}\n".encode())  # print may have been interrupted itself, and is not reentrant
+
+
+def follow_parent() -> None:
+    """In a worker process: ignore Ctrl-C, which the parent handles, and end when the parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent ends, whatever it is doing."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

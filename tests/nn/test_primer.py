@@ -45,7 +45,7 @@ policies = pytest.mark.parametrize("make", POLICIES.values(), ids=POLICIES.keys(
 
 
 def flocking(agents: int = AGENTS, max_steps: int = 7) -> FlockingEnv:
-    """FlockBuffer whose episodes end at different steps."""
+    """Flocks whose episodes end at different steps."""
     return FlockingEnv(FLOCKS, agents, seed=2, max_steps=max_steps, stagger=True)
 
 

@@ -11,13 +11,15 @@ import torch
 from modgnn_rl import load_policy, make_model
 from modgnn_rl.configs.schema import BCConfig, EvaluationConfig, FlockingConfig, ModelConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
+from modgnn_rl.envs.flocking.task import training_env_factory
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers import bc as trainer_module
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise
-from modgnn_rl.trainers.collectors.flocks import FlockBuffer
+from modgnn_rl.trainers.collectors.local import RolloutSpec
+from modgnn_rl.trainers.collectors.rollout_buffer import RolloutBuffer, make_buffer
 from modgnn_rl.trainers.imitation.learner import ImitationLearner, fit_together, validate_together
 from modgnn_rl.trainers.imitation.side_by_side import member_configs
 from modgnn_rl.trainers.loop.callbacks import Callback
@@ -162,13 +164,13 @@ def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path
 @pytest.mark.parametrize("rounds", [2, 6])
 @pytest.mark.parametrize(("settings", "sets"), [({}, 1), ({"dart": True}, 4)])
 def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settings, sets, rounds, bc_config):
-    seen, keep = [], FlockBuffer.keep
+    seen, extend = [], RolloutBuffer.extend
 
     def watched(self, rollouts):
-        keep(self, rollouts)
+        extend(self, rollouts)
         seen.append((*rollouts.shape, self.seen))
 
-    monkeypatch.setattr(FlockBuffer, "keep", watched)
+    monkeypatch.setattr(RolloutBuffer, "extend", watched)
     train(bc_config(tmp_path, cloning_updates=rounds, stride=1, noise=0.2, **settings), evaluate=False)
     of_training = [entry for entry in seen if entry[0] == 8]
     assert len(of_training) == sets
@@ -178,9 +180,10 @@ def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settin
 
 def _flights(policies, **settings):
     trainer = BCConfig(**{"num_envs": 1, "batch_size": 8, "ema_decay": 0.8, **settings})
-    flocks = FlockBuffer(ENV, trainer, 6, 4, policies, Reynolds(), steps=12, hold_steps=12, seed=0)
-    flocks.keep(flocks.fly(1.0))
-    return trainer, flocks.buffer
+    spec = RolloutSpec(training_env_factory(ENV), 6, 4, steps=12, seed=0)
+    data = make_buffer(spec, trainer, policies, Reynolds(), hold_steps=12)
+    data.extend(data.collect(1.0))
+    return trainer, data.buffer
 
 
 @pytest.mark.parametrize(

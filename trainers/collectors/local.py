@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,100 +11,90 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
 
-from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
-from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.trainers.collectors.remote import RemoteCollector
 from modgnn_rl.trainers.common.state import TensorGroups
+from modgnn_rl.utils.internals import collector_carrier, set_collector_carrier
 from modgnn_rl.utils.seeds import derive_seed, seeded
 
-__all__ = ["FlockCollector", "make_collector"]
+__all__ = ["EnvFactory", "LocalCollector", "RolloutSpec"]
+
+EnvFactory = Callable[[int, int, int, torch.device | str], Any]
 
 
-class FlockCollector:
-    """Flocks of one size that never stop flying, flown through TorchRL's `Collector`.
+@dataclass(frozen=True)
+class RolloutSpec:
+    """Which rollouts a collector collects.
 
-    Each call of `collect` goes on where they were.
-
-    Args:
-        config: the world.
-        num_envs: flocks flown at once, B.
+    Attributes:
+        make_env: task; ``make_env(num_envs, num_agents, seed, device)`` returns a TorchRL environment [B] with the
+            attribute ``generators`` (random generators by name) and the methods ``snapshot`` and ``restore``.
+        num_envs: environments that run in parallel, B.
         num_agents: agents in each, N.
-        behaviour: the modules that fly and label, in this order (weights changed in place are flown at once).
-        steps: steps of one call of `collect`.
-        seed: seeds the environment, and the draws of modules that draw from torch's global generator.
-        device: where flocks and data live.
+        steps: steps of each call of `LocalCollector.collect`, T.
+        seed: seeds the environments, and modules of the acting policy that use torch's global generators.
+        device: device of environments and rollouts.
     """
 
-    def __init__(
-        self,
-        config: FlockingConfig,
-        num_envs: int,
-        num_agents: int,
-        behaviour: Sequence[TensorDictModuleBase],
-        *,
-        steps: int,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.env = FlockingEnv(
-            num_envs, num_agents, config=config, seed=derive_seed(seed, "env"), device=device, stagger=True
-        )
-        self.noise = torch.Generator().manual_seed(derive_seed(seed, "noise"))
-        with seeded(seed, device):  # the collector tries the policy out
+    make_env: EnvFactory
+    num_envs: int
+    num_agents: int
+    steps: int
+    seed: int
+    device: torch.device | str = "cpu"
+
+
+class LocalCollector:
+    """Collects rollouts in this process, through TorchRL's `Collector`; they continue from one call to the next.
+
+    Args:
+        spec: which rollouts.
+        behaviour: modules that act and label, in this order. Weights that are changed in place are used at once.
+    """
+
+    def __init__(self, spec: RolloutSpec, behaviour: Sequence[TensorDictModuleBase]) -> None:
+        self.env = spec.make_env(spec.num_envs, spec.num_agents, derive_seed(spec.seed, "env"), spec.device)
+        self.noise = torch.Generator().manual_seed(derive_seed(spec.seed, "noise"))
+        self.policy = TensorDictSequential(*behaviour)
+        with seeded(spec.seed, spec.device):  # the collector runs the policy once
             self.collector = Collector(
                 self.env,
-                TensorDictSequential(*behaviour),
-                frames_per_batch=num_envs * steps,
+                self.policy,
+                frames_per_batch=spec.num_envs * spec.steps,
                 total_frames=-1,
                 auto_register_policy_transforms=True,
                 trust_policy=True,
                 no_cuda_sync=True,
             )
-        self._flights: Iterator[TensorDictBase] = iter(self.collector)
+        self._rollouts: Iterator[TensorDictBase] = iter(self.collector)
 
     @torch.no_grad()
     def collect(self) -> TensorDictBase:
-        """Continue the rollouts by some steps; rollouts [B, T]. Torch's global generators are left as they were."""
+        """Continue the rollouts; returns [B, T]. The state of torch's global generators is preserved."""
         seed = int(torch.randint(2**31, (), generator=self.noise))
         with seeded(seed, self.env.device):
-            return next(self._flights)
+            return next(self._rollouts)
 
     @property
     def generators(self) -> dict[str, torch.Generator]:
-        """All that draws at random here, by name."""
-        return {"env": self.env.generator, "faults": self.env.perturbations.generator, "noise": self.noise}
+        """All random generators of the collector, by name."""
+        return {**self.env.generators, "noise": self.noise}
 
     def state(self) -> tuple[TensorGroups, dict[str, Any]]:
-        """What a checkpoint holds of the rollouts."""
-        # TorchRL has no public name for what it carries from step to step, messages among it; its own numbers of
-        # trajectories need not be the same.
-        carried = self.collector._carrier.exclude("collector").flatten_keys("/")
+        """The state of the rollouts for a checkpoint, without generators: tensors and plain values."""
+        # The messages are carried from step to step; the trajectory ids of TorchRL need not be restored.
+        carried = collector_carrier(self.collector).exclude("collector").flatten_keys("/")
         return {"env": self.env.snapshot(), "carried": dict(carried.items())}, {}
 
     def restore(self, tensors: TensorGroups, values: dict[str, Any]) -> None:
-        """Go on from what `state` gave.
+        """Resume from the result of `state`.
 
         Raises:
-            KeyError, RuntimeError: these are rollouts of other flocks.
+            KeyError, RuntimeError: the state is that of other environments.
         """
         self.env.restore(tensors["env"])
-        carried = self.collector._carrier
-        found = TensorDict(tensors["carried"], carried.batch_size, device=self.env.device).unflatten_keys("/")
-        self.collector._carrier = carried.select("collector").update(found)
+        carrier = collector_carrier(self.collector)
+        restored = TensorDict(tensors["carried"], carrier.batch_size, device=self.env.device).unflatten_keys("/")
+        set_collector_carrier(self.collector, carrier.select("collector").update(restored))
 
     def close(self) -> None:
-        """End the rollouts."""
+        """Close the environments."""
         self.collector.shutdown()
-
-
-def make_collector(
-    collector: CollectorConfig | None, config: FlockingConfig, *arguments: Any, **options: Any
-) -> FlockCollector | RemoteCollector:
-    """Flocks of one size, flown in this process (also for None) or by workers; for the arguments see `FlockCollector`.
-
-    Raises:
-        InputError: see `RemoteCollector`.
-    """
-    if collector is None or collector.name == "single":
-        return FlockCollector(config, *arguments, **options)
-    return RemoteCollector(config, *arguments, **options, collector=collector)

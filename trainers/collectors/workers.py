@@ -1,13 +1,15 @@
-"""Workers that fly flocks elsewhere: processes of this machine, or actors of Ray, each with a TorchRL collector.
+"""Workers that collect rollouts: processes on this machine, or actors of Ray. Each runs a `LocalCollector`.
 
-TorchRL's collectors of several workers end with the first worker that dies. So each worker here is a collector of its
-own, with one worker, and can be replaced alone.
+TorchRL's collectors with several workers end all of them when one dies. Here each worker can be replaced alone.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import io
 import logging
+import multiprocessing
 import os
 import pickle
 import secrets
@@ -15,279 +17,294 @@ import shutil
 import signal
 import socket
 import tempfile
-import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, wait
-from threading import Lock, Thread
-from typing import Any, TypeVar
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from multiprocessing.connection import Connection
+from threading import Thread
+from typing import Any, Protocol
 
+import cloudpickle
 import torch
-from torchrl.collectors import MultiSyncCollector
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from modgnn_rl.errors import InputError
-from modgnn_rl.trainers.collectors.worker import WorkerCollector, WorkerSpec
+from modgnn_rl.trainers.collectors.behaviour import BetaMixture
+from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
+from modgnn_rl.utils.seeds import derive_seed
+from modgnn_rl.utils.signals import follow_parent
 
-__all__ = ["ProcessWorker", "RayWorker", "Worker", "WorkerEndedError", "close_all"]
+__all__ = ["ProcessWorker", "RayWorker", "Worker", "WorkerCollector", "WorkerEndedError", "get_weights", "pack"]
 
-RAY_MEMORY = 256 * 2**20  # bytes that Ray's store of objects may take here: rollouts pass through it
-STARTING = 120.0  # longest wait for a worker to start, s
-PATIENCE = 5.0  # longest wait for a worker to end by itself, s
-
-Result = TypeVar("Result")
+RAY_MEMORY = 256 * 2**20  # bytes of Ray's object store on this machine; rollouts pass through it
 
 
 class WorkerEndedError(Exception):
     """A worker has ended, or was ended because it did not answer; the message says how."""
 
 
-class Worker:
-    """A TorchRL collector with one worker, and threads that wait for it, so that nobody waits for ever.
+class _Pickler(cloudpickle.Pickler):
+    """Pickles random generators, too, and modules defined in the user's own script."""
 
-    Args:
-        rollout: what it flies.
-        address: of a Ray cluster.
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, torch.Generator):
+            return torch.Generator, (str(value.device),)
+        return super().reducer_override(value)
 
-    Attributes:
-        process: number of its process; None as long as it is starting.
-        started: done when it has started.
+
+class _PickleModule:
+    """The functions of `pickle` that `torch.save` uses."""
+
+    Pickler = _Pickler
+    dumps, load, loads = cloudpickle.dumps, pickle.load, pickle.loads
+
+
+def pack(spec: RolloutSpec, behaviour: Sequence[TensorDictModuleBase]) -> bytes:
+    """What a worker collects, in a form that can be sent; generators lose their state.
+
+    Raises:
+        InputError: a module cannot be sent.
     """
+    file = io.BytesIO()
+    try:
+        torch.save((spec, list(behaviour)), file, pickle_module=_PickleModule)
+    except (pickle.PicklingError, TypeError, AttributeError) as error:
+        names = ", ".join(type(module).__name__ for module in behaviour)
+        raise InputError(
+            f"one of the modules of the acting policy ({names}) cannot be sent to other processes ({error}); make it "
+            "picklable, or use collector=single"
+        ) from error
+    return file.getvalue()
 
-    def __init__(self, rollout: WorkerSpec, address: str | None = None) -> None:
-        self.rollout, self.address = rollout, address
-        self.process: int | None = None
-        self.collector: Any = None
-        self.started = _in_thread(self._start)
-        self._answer: Future[Any] = self.started
 
-    def ask(self, method: str, *arguments: Any) -> None:
-        """Begin a call of a method of the worker's `WorkerCollector`."""
-        self._answer = _in_thread(self._ask, method, *arguments)
+def get_weights(behaviour: Sequence[TensorDictModuleBase]) -> bytes:
+    """The weights and extra state of modules, as `WorkerCollector.collect` takes them."""
+    file = io.BytesIO()
+    torch.save(nn.ModuleList(behaviour).state_dict(), file)
+    return file.getvalue()
 
-    def answer(self, timeout: float) -> Any:
-        """Wait for the result of the call that was begun.
+
+class WorkerCollector:
+    """The collector inside a worker. It returns pickled results: tensors would pass through files in shared memory."""
+
+    def start(self, packed: bytes) -> bytes:
+        """Create the `LocalCollector`; returns host and process id.
 
         Args:
-            timeout: longest wait, s; a worker that takes longer is ended. Starting does not count.
+            packed: made by `pack`. Generators of modules are seeded by the module's ``seed_role``, or its class name.
+        """
+        follow_parent()
+        logging.getLogger("torchrl").setLevel(logging.WARNING)
+        torch.set_num_threads(1)
+        spec, behaviour = torch.load(io.BytesIO(packed), weights_only=False)
+        self.behaviour = nn.ModuleList(behaviour)
+        generators = {}
+        for name, module in self.behaviour.named_modules():
+            for key, value in vars(module).items():
+                if isinstance(value, torch.Generator):
+                    role = getattr(module, "seed_role", type(module).__name__.lower())
+                    generators[f"{name}.{key}"] = value.manual_seed(derive_seed(spec.seed, role))
+        self.collector = LocalCollector(spec, behaviour)
+        self.generators = self.collector.generators | generators
+        mixtures = [module for module in self.behaviour.modules() if isinstance(module, BetaMixture)]
+        self.mixtures = {f"mixture{number}": mixture for number, mixture in enumerate(mixtures)}
+        return pickle.dumps((socket.gethostname(), os.getpid()))
+
+    def collect(self, weights: bytes) -> bytes:
+        """Continue the rollouts with these weights; returns [B, T] on the CPU."""
+        self._load(weights)
+        return pickle.dumps(self.collector.collect().to("cpu"))
+
+    def state(self) -> bytes:
+        """The state of rollouts and generators for a checkpoint."""
+        tensors, _ = self.collector.state()
+        tensors["generators"] = {name: generator.get_state() for name, generator in self.generators.items()}
+        tensors |= {name: mixture.state() for name, mixture in self.mixtures.items()}
+        return pickle.dumps({group: {key: value.cpu() for key, value in own.items()} for group, own in tensors.items()})
+
+    def restore(self, weights: bytes, state: bytes) -> bytes:
+        """Resume from the result of `state`."""
+        self._load(weights)
+        tensors = pickle.loads(state)
+        self.collector.restore(tensors, {})
+        for name, generator in self.generators.items():
+            generator.set_state(tensors["generators"][name])
+        for name, mixture in self.mixtures.items():
+            mixture.restore(tensors[name])
+        return pickle.dumps(None)
+
+    def _load(self, weights: bytes) -> None:
+        self.behaviour.load_state_dict(torch.load(io.BytesIO(weights), map_location="cpu", weights_only=True))
+
+
+class Worker(Protocol):
+    """A worker; `call` begins to call a method of its `WorkerCollector`, `result` waits for the result."""
+
+    pid: int | None
+
+    def call(self, method: str, *arguments: bytes) -> None:
+        """Begin a call."""
+
+    def result(self, timeout: float) -> Any:
+        """Wait for the result of the call, at most ``timeout`` s.
 
         Raises:
-            WorkerEndedError: the worker has ended.
-            Exception: what was raised in a worker that is still there.
+            WorkerEndedError: the worker has ended, or did not answer in time.
+            Exception: raised in the worker, which still runs.
         """
-        if self._answer in wait([self._answer], timeout + (0.0 if self.started.done() else STARTING)).done:
-            return self._answer.result()
-        self.kill()
-        wait([self._answer], PATIENCE)
-        raise WorkerEndedError(f"no answer within {timeout:g} s")
-
-    def _ask(self, method: str, *arguments: Any) -> Any:
-        self.started.result()
-        return self._call(method, *arguments)
 
     def kill(self) -> None:
-        """End the worker at once; a future not done yet raises `WorkerEndedError`."""
-        raise NotImplementedError
+        """End the worker at once."""
 
-    def close(self) -> None:
-        """End the worker, at once if it is busy."""
-        if not self._answer.done():
+
+class ProcessWorker:
+    """A worker process on this machine; ``address`` is not used."""
+
+    def __init__(self, address: str | None = None) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, pipe = context.Pipe()
+        self._process = context.Process(target=_serve, args=(pipe,), daemon=True)
+        self._process.start()
+        pipe.close()  # so that the end of the worker is the end of the pipe
+        self.pid = self._process.pid
+
+    def call(self, method: str, *arguments: bytes) -> None:
+        """Begin a call; see `Worker`."""
+        self._answer = _in_thread(self._call, pickle.dumps((method, arguments)))
+
+    def _call(self, message: bytes) -> Any:
+        try:
+            self._pipe.send_bytes(message)  # waits for ever for a process that was stopped: hence the thread
+            is_error, value = pickle.loads(self._pipe.recv_bytes())
+        except (EOFError, OSError) as error:
+            self._process.join()
+            raise WorkerEndedError(f"exit code {self._process.exitcode}") from error
+        if is_error:
+            raise value
+        return pickle.loads(value)
+
+    def result(self, timeout: float) -> Any:
+        """Wait for the result of the call; see `Worker`."""
+        try:
+            return self._answer.result(timeout)
+        except FutureTimeoutError as error:
             self.kill()
-            wait([self._answer], PATIENCE)
-        if self.collector is not None:
-            self.collector.shutdown(timeout=PATIENCE)
-
-    def _start(self) -> None:
-        raise NotImplementedError
-
-    def _call(self, method: str, *arguments: Any) -> Any:
-        raise NotImplementedError
-
-
-def close_all(workers: Sequence[Worker]) -> None:
-    """End workers, all at once."""
-    threads = torch.get_num_threads()
-    wait([_in_thread(worker.close) for worker in workers])
-    torch.set_num_threads(threads)  # TorchRL would take as many more as there were workers
-
-
-class _OneProcess(MultiSyncCollector):
-    """A collector that its worker knows while it is still starting, so that the process can be ended."""
-
-    def __init__(self, worker: Worker) -> None:
-        worker.collector = self
-        super().__init__(
-            [worker.rollout.make_env],
-            collector_class=WorkerCollector,
-            num_threads=torch.get_num_threads(),
-            auto_register_policy_transforms=True,
-            total_frames=-1,
-            **worker.rollout.options,
-        )
-
-
-class ProcessWorker(Worker):
-    """A process of this machine, held by TorchRL's `MultiSyncCollector`."""
-
-    def _start(self) -> None:
-        try:
-            _OneProcess(self)
-        except Exception as error:
-            explained = self._explained(error)
-            if isinstance(explained, WorkerEndedError) and self.collector.procs[0].exitcode == 0:
-                explained = error  # it said why it cannot start, and left
-            if isinstance(error, InputError):
-                explained = InputError(str(error).partition("\n\nWorker traceback")[0])
-            raise explained from error
-        self.process = self.collector.procs[0].pid
-
-    def _call(self, method: str, *arguments: Any) -> Any:
-        try:
-            return pickle.loads(self.collector.map_fn(method, [arguments])[0])
-        except Exception as error:
-            raise self._explained(error) from error
-
-    def _explained(self, error: Exception) -> Exception:
-        for process in getattr(self.collector, "procs", []):
-            process.join(1.0 if isinstance(error, (EOFError, OSError)) else 0.1)
-            if not process.is_alive():
-                return WorkerEndedError(f"exit code {process.exitcode}")
-        return error
+            raise WorkerEndedError(f"no answer within {timeout:g} s") from error
 
     def kill(self) -> None:
-        """End the worker at once; a future not done yet raises `WorkerEndedError`."""
-        for process in getattr(self.collector, "procs", []):
-            process.kill()
+        """End the process at once."""
+        self._process.kill()
+        self._process.join()
 
 
-class RayWorker(Worker):
-    """An actor of Ray, held by TorchRL's `RayCollector`; Ray starts with the first and ends with the last of them."""
+def _serve(pipe: Connection) -> None:
+    """Run in a worker process: answer calls until the pipe ends."""
+    collector = WorkerCollector()
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            method, arguments = pickle.loads(pipe.recv_bytes())
+            try:
+                answer = (False, getattr(collector, method)(*arguments))
+            except Exception as error:
+                answer = (True, error)
+            pipe.send_bytes(cloudpickle.dumps(answer))
 
-    host: str | None = None
 
-    def __init__(self, rollout: WorkerSpec, address: str | None = None) -> None:
-        _Ray.begin(address)
-        super().__init__(rollout, address)
+def _in_thread(function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Call a function in a thread that does not keep this process alive."""
+    future: Future[Any] = Future()
 
-    def _start(self) -> None:
-        from torchrl.collectors.distributed import RayCollector
+    def run() -> None:
+        try:
+            future.set_result(function(*arguments))
+        except BaseException as error:
+            future.set_exception(error)
 
-        on_gpu = torch.device(self.rollout.device).type != "cpu"
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*weight", category=UserWarning)
-            self.collector = RayCollector(
-                [self.rollout.make_env],
-                collector_class=WorkerCollector,
-                collector_kwargs={"auto_register_policy_transforms": True},
-                remote_configs={"num_cpus": 0 if self.address is None else 1, "num_gpus": 0.01 if on_gpu else 0},
-                sync=True,
-                **self.rollout.options,
-            )
-        self.host, self.process = self._call("whereabouts")
+    Thread(target=run, daemon=True).start()
+    return future
 
-    def _call(self, method: str, *arguments: Any) -> Any:
-        from ray.exceptions import RayError, RayTaskError
+
+class RayWorker:
+    """An actor of the Ray cluster at ``address``, or of Ray on this machine, which ends with this process."""
+
+    def __init__(self, address: str | None = None) -> None:
+        _start_ray(address)
+        import ray
+
+        resources = {"num_cpus": 0 if address is None else 1, "num_gpus": 0.01 if torch.cuda.is_available() else 0}
+        self._actor = ray.remote(**resources)(WorkerCollector).remote()
+        self.pid: int | None = None
+
+    def call(self, method: str, *arguments: bytes) -> None:
+        """Begin a call; see `Worker`."""
+        self._is_start = method == "start"
+        self._answer = getattr(self._actor, method).remote(*arguments)
+
+    def result(self, timeout: float) -> Any:
+        """Wait for the result of the call; see `Worker`."""
+        import ray
+        from ray.exceptions import GetTimeoutError, RayError, RayTaskError
 
         try:
-            return pickle.loads(self.collector.map_fn(method, [arguments])[0])
+            value = pickle.loads(ray.get(self._answer, timeout=timeout))
+        except GetTimeoutError as error:
+            self.kill()
+            raise WorkerEndedError(f"no answer within {timeout:g} s") from error
         except RayTaskError as error:
             raise (error.cause if isinstance(error.cause, Exception) else error) from error
         except RayError as error:
             raise WorkerEndedError(str(error).strip().splitlines()[0].rstrip(".")) from error
+        if self._is_start and value[0] == socket.gethostname():
+            self.pid = value[1]
+        return value
 
     def kill(self) -> None:
-        """End the worker at once; a future not done yet raises `WorkerEndedError`."""
+        """End the actor at once."""
         import ray
 
-        if self.process is not None and self.host == socket.gethostname():
+        if self.pid is not None:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self.process, signal.SIGKILL)  # Ray would ask it to end, and it may not be able to
-        for actor in getattr(self.collector, "remote_collectors", []):
-            ray.kill(actor)
-
-    def close(self) -> None:
-        """End the worker, and with the last one Ray."""
-        super().close()
-        _Ray.end()
+                os.kill(self.pid, signal.SIGKILL)  # Ray waits for a process that was stopped
+        if ray.is_initialized():
+            ray.kill(self._actor)
 
 
-class _Ray:
-    """Ray, from the first worker that needs it to the last; one that runs already in this process is left alone."""
+def _start_ray(address: str | None) -> None:
+    """Start Ray on this machine, or connect to a cluster, unless this process has done so; it ends with the process.
 
-    lock = Lock()
-    workers = 0
-    is_ours = False
-    folder: str | None = None
+    Raises:
+        InputError: Ray does not start, or no cluster answers.
+    """
+    import ray
 
-    @classmethod
-    def begin(cls, address: str | None) -> None:
-        """Start Ray, or connect to the cluster, in the main thread: what Ray starts ends with the thread."""
-        import ray
-
-        with cls.lock:
-            if not ray.is_initialized():
-                os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-                options = cls._small() if address is None else {"address": address}
-                cls.is_ours = True
-                on_sigterm = signal.getsignal(signal.SIGTERM)
-                try:
-                    ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
-                except Exception as error:
-                    cls._end()
-                    reason = str(error).strip().splitlines()[0]
-                    where = "on this machine"
-                    if address is not None:
-                        where = (
-                            f"at collector.ray_address={address}, with the RAY_AUTH_MODE and token that are set here"
-                        )
-                    raise InputError(f"Ray cannot be used {where} ({reason}); collector=process needs none") from error
-                if callable(on_sigterm):  # Ray has put its own in the place of a run's
-                    signal.signal(signal.SIGTERM, on_sigterm)
-            cls.workers += 1
-
-    @classmethod
-    def end(cls) -> None:
-        """End Ray with its last worker, and take away what it has left on this machine."""
-        with cls.lock:
-            cls.workers -= 1
-            if cls.workers == 0 and cls.is_ours:
-                cls._end()
-
-    @classmethod
-    def _small(cls) -> dict[str, Any]:
-        """How to start Ray here."""
-        if "RAY_AUTH_TOKEN_PATH" not in os.environ:  # else Ray would put a password into the home directory
+    if ray.is_initialized():
+        return
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    folder = tempfile.mkdtemp(prefix="modgnn_rl-ray-")
+    options: dict[str, Any] = {"address": address}
+    if address is None:
+        if "RAY_AUTH_TOKEN_PATH" not in os.environ:  # else Ray writes a token into the home directory
             os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
-        cls.folder = tempfile.mkdtemp(prefix="modgnn_rl-ray-")
-        return {
-            "address": "local",
-            "num_cpus": 1,
-            "object_store_memory": RAY_MEMORY,
-            "include_dashboard": False,
-            "_temp_dir": cls.folder,
-            "_system_config": {"worker_niceness": 0},
-        }
-
-    @classmethod
-    def _end(cls) -> None:
-        import ray
-
-        ray.shutdown()
-        cls.is_ours = False
-        if cls.folder is not None:
-            shutil.rmtree(cls.folder, ignore_errors=True)
-            cls.folder = None
+        options = {"address": "local", "num_cpus": 1, "object_store_memory": RAY_MEMORY, "include_dashboard": False}
+        options |= {"_temp_dir": folder, "_system_config": {"worker_niceness": 0}}
+    on_sigterm = signal.getsignal(signal.SIGTERM)
+    atexit.register(_stop_ray, folder)
+    try:
+        ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
+    except Exception as error:
+        _stop_ray(folder)
+        reason = str(error).strip().splitlines()[0]
+        where = "on this machine"
+        if address is not None:
+            where = f"at collector.ray_address={address} with the RAY_AUTH_MODE and token set here"
+        raise InputError(f"Ray cannot be used {where} ({reason}); collector=process does not need it") from error
+    if callable(on_sigterm):  # Ray has replaced the run's handler
+        signal.signal(signal.SIGTERM, on_sigterm)
 
 
-def _in_thread(function: Callable[..., Result], *arguments: Any) -> Future[Result]:
-    """Call a function in a thread that does not keep this process from ending."""
-    future: Future[Result] = Future()
+def _stop_ray(folder: str) -> None:
+    import ray
 
-    def run() -> None:
-        try:
-            result = function(*arguments)
-        except BaseException as error:
-            future.set_exception(error)
-        else:
-            future.set_result(result)
-
-    Thread(target=run, daemon=True).start()
-    return future
+    ray.shutdown()
+    shutil.rmtree(folder, ignore_errors=True)

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
-from tensordict.nn import TensorDictModuleBase
 from torchrl.data import ReplayBuffer
 
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
 from modgnn_rl.data.dataset import EpisodeDataset
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.collectors.flocks import FlockBuffer, make_buffers, make_validation_buffers
+from modgnn_rl.trainers.collectors.rollout_buffer import RolloutBuffer, make_buffers, make_validation_buffers
 from modgnn_rl.trainers.common.state import TensorGroups
+from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.trainers.loop.training_loop import Rollouts, TrainingLoop
 from modgnn_rl.utils.seeds import derive_seed
 
@@ -46,20 +46,17 @@ class Demonstrations(Protocol):
         """Collect what is due in the current round; returns metrics."""
 
 
-def make_demonstrations(
-    config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDictModuleBase, rounds: int
-) -> Demonstrations:
+def make_demonstrations(context: TrainContext, policies: Sequence[ModGNN], rounds: int) -> Demonstrations:
     """The demonstrations for behaviour cloning: the dataset of ``config.trainer``, or rollouts of the expert.
 
     Args:
-        config: the run's settings.
+        context: the run.
         policies: the policies that learn from them.
-        expert: acts and labels.
         rounds: number of rounds of the training.
     """
-    if config.trainer.dataset is not None:
-        return _Dataset(config, policies)
-    return _ExpertRollouts(config, policies, expert, rounds)
+    if context.config.trainer.dataset is not None:
+        return _Dataset(context.config, policies)
+    return _ExpertRollouts(context, policies, rounds)
 
 
 class _ExpertRollouts:
@@ -69,16 +66,15 @@ class _ExpertRollouts:
     to recover: here the standard deviation is the root of the policy's mean squared error on validation data.
     """
 
-    def __init__(
-        self, config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDictModuleBase, rounds: int
-    ) -> None:
+    def __init__(self, context: TrainContext, policies: Sequence[ModGNN], rounds: int) -> None:
+        config, make_env, expert = context.config, context.make_env, context.expert
         self.settings: BCConfig = config.trainer
         self.parts = DART_PARTS if self.settings.dart else 1
         self.starts = [part * rounds // self.parts for part in range(self.parts)]  # rounds before each part
         steps = max(1, self.settings.cloning_steps // self.parts)
         options: dict[str, Any] = {"steps": steps, "hold_steps": self.settings.cloning_steps}
-        self.validation = make_validation_buffers(config, policies, expert, **options)
-        self.training = make_buffers(config, policies, expert, **options)
+        self.validation = make_validation_buffers(config, make_env, policies, expert, **options)
+        self.training = make_buffers(config, make_env, policies, expert, **options)
 
     def collect(self, loop: TrainingLoop) -> dict[str, float]:
         """Let the expert act where a part starts, and in any case if there are no data yet."""
@@ -86,17 +82,17 @@ class _ExpertRollouts:
             for _ in range(max(self.starts.count(loop.step - 1), not buffer.seen)):
                 is_adapted = self.settings.dart and loop.step > 1
                 noise = loop.state["validation_loss"] ** 0.5 if is_adapted else self.settings.noise
-                buffer.action_noise.scale = noise
-                buffer.keep(loop.on_collect(buffer.fly(beta=1.0)))
+                buffer.collector.action_noise.scale = noise
+                buffer.extend(loop.on_collect(buffer.collect(beta=1.0)))
         collect_validation(self.validation, self.parts)
-        return {"noise": next(iter(self.training.values())).action_noise.scale}
+        return {"noise": next(iter(self.training.values())).collector.action_noise.scale}
 
 
-def collect_validation(buffers: Mapping[int, FlockBuffer], times: int) -> None:
+def collect_validation(buffers: Mapping[int, RolloutBuffer], times: int) -> None:
     """Let the expert act in the validation environments, ``times`` times, unless they have data already."""
     for buffer in buffers.values():
         for _ in range(0 if buffer.seen else times):
-            buffer.keep(buffer.fly(beta=1.0))
+            buffer.extend(buffer.collect(beta=1.0))
 
 
 @dataclass

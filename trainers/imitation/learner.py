@@ -17,7 +17,7 @@ from torchrl.data import ReplayBuffer
 from modgnn_rl.configs.schema import ImitationConfig
 from modgnn_rl.models.blocks import is_equivariant
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.collectors.windows import are_alike
+from modgnn_rl.trainers.collectors.windows import have_same_architecture
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.optimization import GuardedOptimizer
 from modgnn_rl.trainers.common.sampling import random_receivers, receivers_per_state
@@ -162,7 +162,7 @@ def fit_together(learners: Sequence[ImitationLearner], buffer: ReplayBuffer, upd
     """
     first, policies = learners[0], [learner.policy for learner in learners]
     with_rotation = any(learner.rotates for learner in learners)
-    alike = len(learners) > 1 and are_alike(policies)
+    alike = len(learners) > 1 and have_same_architecture(policies)
     records = []
     for _ in range(updates):
         batch = buffer.sample()

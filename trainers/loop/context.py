@@ -11,6 +11,7 @@ from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.tracking.checkpoint import Checkpoint
 from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
+from modgnn_rl.trainers.collectors.local import EnvFactory
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.utils.signals import GracefulInterrupt
 
@@ -21,10 +22,12 @@ __all__ = ["TrainContext"]
 class TrainContext:
     """One training run.
 
-    A trainer reads `config` and `expert`; the rest is for `modgnn_rl.trainers.loop.training_loop.TrainingLoop`.
+    A trainer reads `config`, `make_env` and `expert`; the rest is for
+    `modgnn_rl.trainers.loop.training_loop.TrainingLoop`.
 
     Attributes:
         config: all settings, checked; in distributed training those of this process.
+        make_env: creates environments for training; see `modgnn_rl.trainers.collectors.local.RolloutSpec`.
         expert: labels every state, under ``("agents", "expert_action")``.
         run: folder for metrics and checkpoints.
         loggers: where metrics go in addition to ``metrics.jsonl``.
@@ -35,6 +38,7 @@ class TrainContext:
     """
 
     config: TrainConfig
+    make_env: EnvFactory
     expert: TensorDictModuleBase
     run: RunFolder
     loggers: LoggerGroup

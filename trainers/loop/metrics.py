@@ -23,7 +23,7 @@ def rollout_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dic
     """Metrics of rollouts that a trainer has collected.
 
     Args:
-        rollouts: [B, T]; if the expert acted in some, ``expert_flies`` [B, T, 1] tells in which.
+        rollouts: [B, T]; if the expert acted in some, ``expert_acts`` [B, T, 1] tells in which.
         env_config: defines when a flock has diverged or lost its leader.
 
     Returns:
@@ -32,7 +32,7 @@ def rollout_metrics(rollouts: TensorDictBase, env_config: FlockingConfig) -> dic
         metrics of `modgnn_rl.envs.flocking.metrics`.
     """
     agents = rollouts["agents"]
-    counted, expert_acts = agents["controlled"], rollouts.get("expert_flies", None)
+    counted, expert_acts = agents["controlled"], rollouts.get("expert_acts", None)
     if expert_acts is not None:
         counted = counted & ~expert_acts
     error = action_error(agents.get("loc", agents["action"]), agents["expert_action"], counted).nanmean()

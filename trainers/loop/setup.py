@@ -15,8 +15,8 @@ from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
 from modgnn_rl.tracking.loading import load_policy, stored_model
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.collectors.flocks import flocks_of
 from modgnn_rl.trainers.collectors.remote import check_collector
+from modgnn_rl.trainers.collectors.rollout_buffer import num_envs_of_size
 from modgnn_rl.trainers.imitation.learner import ImitationLearner
 from modgnn_rl.utils.seeds import derive_seed
 
@@ -108,7 +108,7 @@ def check_training(config: TrainConfig, expert: TensorDictModuleBase | None = No
     if check is not None:
         check(config, policies, expert)
     for size in sizes:
-        check_collector(config.collector, flocks_of(size, config))
+        check_collector(config.collector, num_envs_of_size(config, size))
         with contextlib.closing(FlockingEnv(1, size, config=config.env, seed=config.seed)) as env:
             env.reset()
 

@@ -16,7 +16,7 @@ from torchrl.objectives import ValueEstimators
 
 from modgnn_rl.configs.schema import MAPPOConfig
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.trainers.collectors.windows import as_windows
+from modgnn_rl.trainers.collectors.windows import slice_windows
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.optimization import GuardedOptimizer
 from modgnn_rl.trainers.common.sampling import random_receivers, receivers_per_state
@@ -133,7 +133,7 @@ class PPOLearner:
         names = ("controlled", "action", "action_log_prob", "advantage", "value_target")
         agents = [("agents", name) for name in names]
         kept = [*self.policy.in_keys, *agents, self.critic.state_key, REFERENCE_ACTION]
-        windows = as_windows(rollouts.select(*kept, strict=False), self.window, self.window - self.burn_in)
+        windows = slice_windows(rollouts.select(*kept, strict=False), self.window, self.window - self.burn_in)
         buffer = ReplayBuffer(
             storage=LazyTensorStorage(len(windows), device=self.device, compilable=True),
             sampler=SamplerWithoutReplacement(),

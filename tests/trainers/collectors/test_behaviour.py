@@ -1,4 +1,4 @@
-"""Laws of the expert's share and of the mixture."""
+"""Laws of beta schedules and of the mixture."""
 
 from __future__ import annotations
 
@@ -12,55 +12,55 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.trainers.collectors.behaviour import BetaMixture, beta_schedule
 
 
-def _share(schedule, index):
+def _beta(schedule, index):
     return beta_schedule(schedule, index, start=0.8, decay=0.5, last_round=10)
 
 
 def test_schedules_have_their_closed_forms():
-    assert [_share("constant", k) for k in (0, 9)] == [0.8, 0.8]
-    assert _share("linear", 5) == pytest.approx(0.4)
-    assert _share("exponential", 3) == pytest.approx(0.1)
+    assert [_beta("constant", k) for k in (0, 9)] == [0.8, 0.8]
+    assert _beta("linear", 5) == pytest.approx(0.4)
+    assert _beta("exponential", 3) == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("schedule", ["constant", "linear", "exponential"])
-def test_the_expert_leaves_in_the_end(schedule):
-    shares = [_share(schedule, k) for k in range(12)]
-    assert all(later <= earlier for earlier, later in itertools.pairwise(shares))
-    assert shares[10] == shares[11] == 0.0
+def test_beta_falls_to_zero(schedule):
+    betas = [_beta(schedule, k) for k in range(12)]
+    assert all(later <= earlier for earlier, later in itertools.pairwise(betas))
+    assert betas[10] == betas[11] == 0.0
 
 
-def _fly(mixture, flocks, agents=3):
+def _act(mixture, flocks, agents=3):
     actions = TensorDict({"action": torch.zeros(flocks, agents, 3), "expert_action": torch.ones(flocks, agents, 3)})
     return mixture(TensorDict({"agents": actions.auto_batch_size_()}, [flocks]))
 
 
-def test_one_flies_all_agents_of_a_flock_for_a_stretch():
+def test_the_choice_holds_for_all_agents_of_a_flock_and_for_hold_steps():
     mixture = BetaMixture(0.5, 4, torch.Generator().manual_seed(0))
-    rollouts = torch.stack([_fly(mixture, 200)["agents", "action"] for _ in range(8)])
-    assert (rollouts == rollouts[:, :, :1, :1]).all()
-    flown = rollouts[:, :, 0, 0]
-    assert (flown[:4] == flown[0]).all()
-    assert (flown[4:] == flown[4]).all()
-    assert (flown[0] != flown[4]).any()
+    actions = torch.stack([_act(mixture, 200)["agents", "action"] for _ in range(8)])
+    assert (actions == actions[:, :, :1, :1]).all()
+    chosen = actions[:, :, 0, 0]
+    assert (chosen[:4] == chosen[0]).all()
+    assert (chosen[4:] == chosen[4]).all()
+    assert (chosen[0] != chosen[4]).any()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-def test_the_share_is_the_share_of_flocks(share):
-    mixture = BetaMixture(share, 1, torch.Generator().manual_seed(0))
-    mixed = _fly(mixture, 4000)
-    assert mixed["expert_flies"].float().mean() == pytest.approx(share, abs=0.03)
-    assert (mixed["agents", "action"][..., 0, 0].bool() == mixed["expert_flies"].squeeze(-1)).all()
+@pytest.mark.parametrize("beta", [0.0, 0.25, 1.0])
+def test_beta_is_the_fraction_of_flocks_in_which_the_expert_acts(beta):
+    mixture = BetaMixture(beta, 1, torch.Generator().manual_seed(0))
+    mixed = _act(mixture, 4000)
+    assert mixed["expert_acts"].float().mean() == pytest.approx(beta, abs=0.03)
+    assert (mixed["agents", "action"][..., 0, 0].bool() == mixed["expert_acts"].squeeze(-1)).all()
 
 
-def test_a_new_share_holds_from_the_next_toss_on():
+def test_a_new_beta_applies_from_the_next_choice_on():
     mixture = BetaMixture(1.0, 3, torch.Generator().manual_seed(0))
-    flown = []
+    acts = []
     for _ in range(6):
-        flown.append(bool(_fly(mixture, 10)["expert_flies"].all()))
+        acts.append(bool(_act(mixture, 10)["expert_acts"].all()))
         mixture.beta = 0.0
-    assert flown == [True] * 3 + [False] * 3
+    assert acts == [True] * 3 + [False] * 3
 
 
 def test_an_unknown_schedule_is_refused():
     with pytest.raises(InputError, match="schedule 'linaer'"):
-        _share("linaer", 0)
+        _beta("linaer", 0)

@@ -1,4 +1,4 @@
-"""Rollouts of worker processes: those of one process, and nothing hangs, is lost or left behind when a worker dies."""
+"""Workers collect the rollouts that one process would, and nothing hangs or is left behind when one dies."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
+from modgnn_rl.envs.flocking.task import training_env_factory
 from modgnn_rl.errors import InputError
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, Ensemble
-from modgnn_rl.trainers.collectors.local import FlockCollector
+from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
 from modgnn_rl.trainers.collectors.remote import RemoteCollector, check_collector
-from modgnn_rl.trainers.collectors.worker import packed
+from modgnn_rl.trainers.collectors.workers import pack
 from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.utils.seeds import derive_seed
 
@@ -37,53 +38,51 @@ import os, sys
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
+from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.trainers.collectors.local import RolloutSpec
 from modgnn_rl.trainers.collectors.remote import RemoteCollector
 if __name__ == "__main__":
-    flown = (make_model("gcn", seed=0), Reynolds())
-    rollouts = RemoteCollector(FlockingConfig(), 2, 3, flown, steps=2, seed=0, collector=CollectorConfig(sys.argv[1],
-    2)) rollouts.collect()
-    print(*(worker.process for worker in rollouts._workers), flush=True)
-    while sys.argv[2] == "fly":
-        rollouts.collect()
+    spec = RolloutSpec(training_env_factory(FlockingConfig()), 2, 3, steps=2, seed=0)
+    behaviour = (make_model("gcn", seed=0), Reynolds())
+    collector = RemoteCollector(spec, behaviour, CollectorConfig(sys.argv[1], 2))
+    collector.collect()
+    print(*(worker.pid for worker in collector.workers), flush=True)
+    while sys.argv[2] == "collect":
+        collector.collect()
 """
 
 
 def behaviour(seed: int = SEED) -> list[TensorDictModuleBase]:
-    """A policy that explores, the expert, and who of them flies."""
+    """A policy with exploration noise, the expert, and the choice between them."""
     generators = [torch.Generator().manual_seed(derive_seed(seed, name)) for name in ("mixture", "disturbance")]
     actor = GaussianActor(make_model("moment_force", seed=0))
     return [actor, Reynolds(), BetaMixture(0.5, 3, generators[0]), ActionNoise(0.1, generators[1])]
 
 
 def remote(
-    name: str = "process", *, timeout: float = 60.0, flown: list[TensorDictModuleBase] | None = None, **env_config
-):
-    return RemoteCollector(
-        FlockingConfig(**env_config),
-        sum(SHARES),
-        AGENTS,
-        flown or behaviour(),
-        steps=STEPS,
-        seed=SEED,
-        collector=CollectorConfig(name, workers=len(SHARES), timeout=timeout),
-    )
+    name: str = "process", *, timeout: float = 60.0, modules: list[TensorDictModuleBase] | None = None, **env_config
+) -> RemoteCollector:
+    spec = RolloutSpec(training_env_factory(FlockingConfig(**env_config)), sum(SHARES), AGENTS, STEPS, SEED)
+    workers = CollectorConfig(name, workers=len(SHARES), timeout=timeout)
+    return RemoteCollector(spec, modules or behaviour(), workers)
 
 
-def local(index: int, **env_config) -> tuple[FlockCollector, list[TensorDictModuleBase]]:
-    """What a worker should fly, in this process."""
+def local(index: int, **env_config) -> tuple[LocalCollector, list[TensorDictModuleBase]]:
+    """A collector in this process that should collect the rollouts of a worker."""
     seed = derive_seed(SEED, "worker", index)
-    flown = behaviour(seed)
-    return FlockCollector(FlockingConfig(**env_config), SHARES[index], AGENTS, flown, steps=STEPS, seed=seed), flown
+    modules = behaviour(seed)
+    spec = RolloutSpec(training_env_factory(FlockingConfig(**env_config)), SHARES[index], AGENTS, STEPS, seed)
+    return LocalCollector(spec, modules), modules
 
 
-def change(flown: Sequence[TensorDictModuleBase]) -> None:
-    """What trainers do between rollouts."""
+def change(modules: Sequence[TensorDictModuleBase]) -> None:
+    """Change weights and settings, as trainers do between rollouts."""
     with torch.no_grad():
-        for parameter in flown[0].parameters():
+        for parameter in modules[0].parameters():
             parameter.mul_(0.5)
-    flown[2].share = 0.2
-    flown[2].restart()
-    flown[3].scale = 0.3
+    modules[2].beta = 0.2
+    modules[2].restart()
+    modules[3].scale = 0.3
 
 
 @pytest.fixture(scope="module")
@@ -93,39 +92,39 @@ def rollouts() -> Iterator[RemoteCollector]:
     rollouts.close()
 
 
-def assert_flies_as_one_process(rollouts: RemoteCollector, **env_config) -> None:
+def assert_equals_local_rollouts(rollouts: RemoteCollector, **env_config) -> None:
     """Two calls, with other weights and settings in between."""
     here = [local(index, **env_config) for index in range(len(SHARES))]
     for _ in range(2):
         there = rollouts.collect()
-        expected: TensorDictBase = torch.cat([flocks.collect() for flocks, _ in here])
+        expected: TensorDictBase = torch.cat([collector.collect() for collector, _ in here])
         assert there.shape == (sum(SHARES), STEPS)
         assert (there.exclude(IDS) == expected.exclude(IDS)).all()
-        for flown in [rollouts.behaviour, *(flown for _, flown in here)]:
-            change(flown)
+        for modules in [rollouts.behaviour, *(modules for _, modules in here)]:
+            change(modules)
 
 
 @pytest.mark.slow
-def test_each_worker_flies_as_one_process_would_and_hears_of_changes(rollouts: RemoteCollector) -> None:
-    assert_flies_as_one_process(rollouts)
+def test_workers_collect_the_rollouts_of_one_process_and_receive_changes(rollouts: RemoteCollector) -> None:
+    assert_equals_local_rollouts(rollouts)
 
 
-def test_flights_go_on_and_each_has_an_id_of_its_own(rollouts: RemoteCollector) -> None:
+def test_rollouts_continue_and_have_unique_ids(rollouts: RemoteCollector) -> None:
     first, second = rollouts.collect(), rollouts.collect()
     torch.testing.assert_close(first["next", "agents", "observation"][:, -1], second["agents", "observation"][:, 0])
     torch.testing.assert_close(first["next", "messages"][:, -1], second["messages"][:, 0])
     assert len(second[IDS][:, 0].unique()) == sum(SHARES)
 
 
-def test_flights_go_on_from_a_state(rollouts: RemoteCollector) -> None:
+def test_rollouts_resume_from_a_state(rollouts: RemoteCollector) -> None:
     tensors, values = rollouts.state()
     noise = [generator.get_state() for generator in rollouts.generators.values()]
-    flown = rollouts.collect()
-    assert not (rollouts.collect() == flown).all()
+    expected = rollouts.collect()
+    assert not (rollouts.collect() == expected).all()
     rollouts.restore(tensors, values)
     for generator, state in zip(rollouts.generators.values(), noise, strict=True):
         generator.set_state(state)
-    assert (rollouts.collect().exclude(IDS) == flown.exclude(IDS)).all()
+    assert (rollouts.collect().exclude(IDS) == expected.exclude(IDS)).all()
 
 
 def test_error_in_a_worker_is_raised_here(rollouts: RemoteCollector) -> None:
@@ -135,55 +134,54 @@ def test_error_in_a_worker_is_raised_here(rollouts: RemoteCollector) -> None:
             parameter.fill_(torch.nan)
     with pytest.raises(InputError, match=r"not finite|NaN|nan"):
         rollouts.collect()
-    assert all(worker.collector.procs[0].is_alive() for worker in rollouts._workers)
+    assert all(is_running(worker.pid) for worker in rollouts.workers)
 
 
-def test_members_of_an_ensemble_travel_with_its_state() -> None:
+def test_weights_of_all_members_are_in_the_state_of_an_ensemble() -> None:
     ensembles = [Ensemble([make_model("gcn", seed=seed + member) for member in range(2)]) for seed in (0, 5)]
     ensembles[1].load_state_dict(ensembles[0].state_dict())
     for one, other in zip(ensembles[0]._others, ensembles[1]._others, strict=True):
         assert all((one.state_dict()[key] == value).all() for key, value in other.state_dict().items())
 
 
-def test_what_cannot_be_shared_out_or_sent_is_refused_at_once() -> None:
+def test_too_many_workers_and_unpicklable_modules_are_refused() -> None:
+    spec = RolloutSpec(training_env_factory(FlockingConfig()), 2, 4, steps=1, seed=0)
     with pytest.raises(InputError, match=r"collector\.workers=3 cannot share 2 flocks"):
-        RemoteCollector(
-            FlockingConfig(), 2, 4, behaviour(), steps=1, seed=0, collector=CollectorConfig("process", workers=3)
-        )
+        RemoteCollector(spec, behaviour(), CollectorConfig("process", workers=3))
     with pytest.raises(InputError, match="cannot be sent to other processes"):
-        packed([TensorDictModule(threading.Lock().acquire, in_keys=["a"], out_keys=["b"])])
+        pack(spec, [TensorDictModule(threading.Lock().acquire, in_keys=["a"], out_keys=["b"])])
 
 
-def test_ray_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_says_how_to_install_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install 'modgnn-rl\[ray\]'"):
         remote("ray")
 
 
-def fly_until_replaced(rollouts: RemoteCollector, process: int) -> TensorDictBase:
+def collect_until_replaced(rollouts: RemoteCollector, process: int) -> TensorDictBase:
     """The rollouts in which the second worker was replaced."""
     while True:
-        flown = rollouts.collect()
-        if rollouts._workers[1].process != process:
-            return flown
+        collected = rollouts.collect()
+        if rollouts.workers[1].pid != process:
+            return collected
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["process", "ray"])
-@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("delay", [0.0, 0.3])
-def test_worker_that_dies_or_hangs_is_replaced(name: str, blow: signal.Signals, delay: float) -> None:
+def test_worker_that_dies_or_hangs_is_replaced(name: str, sent: signal.Signals, delay: float) -> None:
     if name == "ray":
         pytest.importorskip("ray")
     rollouts = remote(name, timeout=5)
     try:
         before = rollouts.collect()
-        process = rollouts._workers[1].process
-        threading.Timer(delay, os.kill, (process, blow)).start()
+        process = rollouts.workers[1].pid
+        threading.Timer(delay, os.kill, (process, sent)).start()
         time.sleep(delay / 2)
         start = time.monotonic()
-        with pytest.warns(RuntimeWarning, match=rf"worker 1 of the 2 .*process {process}.* its 1 flocks begin anew"):
-            during = fly_until_replaced(rollouts, process)
+        with pytest.warns(RuntimeWarning, match=rf"worker 1 of the 2 .*process {process}.* 1 environments are reset"):
+            during = collect_until_replaced(rollouts, process)
         assert time.monotonic() - start < 120
         assert during.shape == before.shape
         assert not is_running(process)
@@ -195,7 +193,7 @@ def test_worker_that_dies_or_hangs_is_replaced(name: str, blow: signal.Signals, 
 
 
 class Dies(TensorDictModuleBase):
-    """A module that ends its process."""
+    """A module that kills its process."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -203,11 +201,11 @@ class Dies(TensorDictModuleBase):
         self.out_keys: list[str] = []
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """End."""
+        """Exit."""
         os._exit(7)
 
 
-def test_cluster_that_does_not_answer_is_named_at_once() -> None:
+def test_unreachable_ray_cluster_is_reported_at_once() -> None:
     pytest.importorskip("ray")
     start = time.monotonic()
     with pytest.raises(InputError, match=r"no Ray cluster answers at collector\.ray_address=127\.0\.0\.1:9 "):
@@ -217,18 +215,18 @@ def test_cluster_that_does_not_answer_is_named_at_once() -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:worker . of the 2:RuntimeWarning")
-def test_worker_that_dies_again_and_again_is_an_error() -> None:
+def test_worker_that_dies_three_times_is_an_error() -> None:
     cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import the tests
-    rollouts = remote(flown=[*behaviour(), Dies()])
+    rollouts = remote(modules=[*behaviour(), Dies()])
     try:
-        with pytest.raises(InputError, match=r"worker 0 .* ended 3 times in a row \(at last: exit code 7\)"):
+        with pytest.raises(InputError, match=r"worker 0 .* ended 3 times in a row \(the last time: exit code 7\)"):
             rollouts.collect()
     finally:
         rollouts.close()
 
 
 @pytest.mark.slow
-def test_what_keeps_a_worker_from_starting_is_raised_here() -> None:
+def test_error_while_a_worker_starts_is_raised_here() -> None:
     rollouts = remote(comm_range=-1.0)
     try:
         with pytest.raises(InputError, match=r"^env\.comm_range=-1\.0 is out of range.*\)$"):
@@ -239,18 +237,18 @@ def test_what_keeps_a_worker_from_starting_is_raised_here() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "physics"), [("process", "bullet"), ("ray", "torch"), ("ray", "bullet")])
-def test_other_physics_and_ray_fly_the_same(name: str, physics: str) -> None:
+def test_ray_and_other_physics_collect_the_same(name: str, physics: str) -> None:
     if name == "ray":
         pytest.importorskip("ray")
     rollouts = remote(name, physics=physics)
     try:
-        assert_flies_as_one_process(rollouts, physics=physics)
+        assert_equals_local_rollouts(rollouts, physics=physics)
     finally:
         rollouts.close()
 
 
 def is_running(process: int) -> bool:
-    """Whether a process is there, and not only waits for somebody to read its exit code."""
+    """Whether a process runs, which a zombie does not."""
     listing = subprocess.run(["ps", "-o", "stat=", "-p", str(process)], capture_output=True, text=True)
     return listing.stdout.strip()[:1] not in ("", "Z")
 
@@ -261,10 +259,10 @@ def is_running(process: int) -> bool:
 def test_workers_end_with_the_parent(tmp_path: Path, name: str, end: str) -> None:
     if name == "ray":
         pytest.importorskip("ray")
-    script, scratch = tmp_path / "fly.py", Path(tempfile.mkdtemp(prefix="m"))  # sockets need a short path
+    script, scratch = tmp_path / "collect.py", Path(tempfile.mkdtemp(prefix="m"))  # sockets need a short path
     script.write_text(SCRIPT)
     parent = subprocess.Popen(
-        [sys.executable, str(script), name, "leave" if end == "forgets to close" else "fly"],
+        [sys.executable, str(script), name, "leave" if end == "forgets to close" else "collect"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

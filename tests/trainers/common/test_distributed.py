@@ -23,12 +23,13 @@ import torch.distributed as dist
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
+from modgnn_rl.envs.flocking.task import training_env_factory
 from modgnn_rl.errors import InputError, NotFinite
 from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.collectors.flocks import FlockBuffer
-from modgnn_rl.trainers.collectors.local import FlockCollector
+from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
+from modgnn_rl.trainers.collectors.rollout_buffer import make_buffer
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.sampling import random_receivers
 from modgnn_rl.trainers.imitation.learner import ImitationLearner
@@ -116,10 +117,11 @@ def _assert_close(one, other):
 def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
     settings = DAggerConfig(batch_size=32, learning_rates=[1e-2, 1e-2, 1e-2])
     policy = make_model("modgnn_mlp", seed=0)
-    flocks = FlockBuffer(ENV, settings, 8, 6, [policy], Reynolds(), steps=20, hold_steps=20, seed=0)
-    flocks.keep(flocks.fly(1.0))
+    spec = RolloutSpec(training_env_factory(ENV), 8, 6, steps=20, seed=0)
+    data = make_buffer(spec, settings, [policy], Reynolds(), hold_steps=20)
+    data.extend(data.collect(1.0))
     chance = torch.Generator().manual_seed(1)
-    batches = [_double(flocks.buffer.sample()) for _ in range(4)]
+    batches = [_double(data.buffer.sample()) for _ in range(4)]
     receivers = [random_receivers(torch.rand(32, 6, generator=chance) < 0.5, 3, chance) for _ in batches]
 
     def learn():
@@ -143,8 +145,9 @@ def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
 def test_improving_on_parts_of_the_flights_is_improving_on_the_whole(tmp_path):
     settings = MAPPOConfig(num_minibatches=1, epochs=3, agents_per_state=100, critic_hidden=8, learning_rate=1e-2)
     actor = GaussianActor(make_model("moment_force", seed=0), 0.3)
-    group = FlockCollector(ENV, 4, 4, (actor, Reynolds()), steps=10, seed=0)
-    rollouts = [_double(group.collect().clone()) for _ in range(2)]
+    spec = RolloutSpec(training_env_factory(ENV), 4, 4, steps=10, seed=0)
+    collector = LocalCollector(spec, (actor, Reynolds()))
+    rollouts = [_double(collector.collect().clone()) for _ in range(2)]
     chance = torch.Generator().manual_seed(1)
     for each in rollouts:
         controlled = each["agents", "controlled"]
@@ -167,9 +170,10 @@ def test_improving_on_parts_of_the_flights_is_improving_on_the_whole(tmp_path):
 def test_all_refuse_what_is_no_number_in_one_process(tmp_path):
     settings = DAggerConfig(on_nonfinite="skip")
     policy = make_model("gcn", seed=0)
-    flocks = FlockBuffer(ENV, settings, 4, 6, [policy], Reynolds(), steps=20, hold_steps=20, seed=0)
-    flocks.keep(flocks.fly(1.0))
-    batch = flocks.buffer.sample()
+    spec = RolloutSpec(training_env_factory(ENV), 4, 6, steps=20, seed=0)
+    data = make_buffer(spec, settings, [policy], Reynolds(), hold_steps=20)
+    data.extend(data.collect(1.0))
+    batch = data.buffer.sample()
 
     def learn(on_nonfinite):
         learner = ImitationLearner(make_model("gcn", seed=0), DAggerConfig(on_nonfinite=on_nonfinite), (2, 4), seed=0)

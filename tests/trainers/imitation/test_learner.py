@@ -11,7 +11,9 @@ import torch
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import FlockBuffer
+from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.trainers.collectors.local import RolloutSpec
+from modgnn_rl.trainers.collectors.rollout_buffer import make_buffer
 from modgnn_rl.trainers.imitation.learner import ImitationLearner, cosine_learning_rate
 
 RATES = (3e-3, 1e-3, 1e-4)
@@ -20,9 +22,8 @@ RATES = (3e-3, 1e-3, 1e-4)
 @pytest.fixture(scope="module")
 def rollouts():
     settings = DAggerConfig(capacity=500, batch_size=64)
-    return FlockBuffer(
-        FlockingConfig(), settings, 8, 6, [make_model("gcn", seed=0)], Reynolds(), steps=40, hold_steps=40, seed=0
-    )
+    spec = RolloutSpec(training_env_factory(FlockingConfig()), 8, 6, steps=40, seed=0)
+    return make_buffer(spec, settings, [make_model("gcn", seed=0)], Reynolds(), hold_steps=40)
 
 
 def _learner(**settings):
@@ -39,7 +40,7 @@ def test_learning_rate_passes_its_three_values_without_jumps():
 
 
 def test_fitting_lowers_the_loss_and_the_optimiser_goes_on(rollouts):
-    rollouts.keep(rollouts.fly(1.0))
+    rollouts.extend(rollouts.collect(1.0))
     learner = _learner()
     before = learner.validate(rollouts.buffer)
     learner.fit(rollouts.buffer, 60)
@@ -49,7 +50,7 @@ def test_fitting_lowers_the_loss_and_the_optimiser_goes_on(rollouts):
 
 
 def test_what_flies_is_the_moving_average_of_the_weights(rollouts):
-    rollouts.keep(rollouts.fly(1.0))
+    rollouts.extend(rollouts.collect(1.0))
     learner = _learner(ema_decay=0.9)
     expected = copy.deepcopy(learner.policy.state_dict())
     for update in range(5):
@@ -65,11 +66,10 @@ def test_one_seed_fixes_the_weights():
     for _ in range(2):
         settings = DAggerConfig(capacity=500, batch_size=64)
         learner = _learner()
-        group = FlockBuffer(
-            FlockingConfig(), settings, 8, 6, [learner.ema_policy], Reynolds(), steps=40, hold_steps=40, seed=0
-        )
-        group.keep(group.fly(0.5))
-        learner.fit(group.buffer, 5)
+        spec = RolloutSpec(training_env_factory(FlockingConfig()), 8, 6, steps=40, seed=0)
+        data = make_buffer(spec, settings, [learner.ema_policy], Reynolds(), hold_steps=40)
+        data.extend(data.collect(0.5))
+        learner.fit(data.buffer, 5)
         weights.append(torch.cat([parameter.flatten() for parameter in learner.ema_policy.parameters()]))
     assert torch.equal(*weights)
 

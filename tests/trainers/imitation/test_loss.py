@@ -11,8 +11,10 @@ from tensordict import TensorDict
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.flocks import FlockBuffer
-from modgnn_rl.trainers.collectors.windows import as_windows, stores_messages, window_of
+from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.trainers.collectors.local import RolloutSpec
+from modgnn_rl.trainers.collectors.rollout_buffer import make_buffer
+from modgnn_rl.trainers.collectors.windows import slice_windows, uses_stored_messages, window_length
 from modgnn_rl.trainers.common.sampling import random_receivers
 from modgnn_rl.trainers.imitation.loss import hide_velocities, imitation_loss, random_rotations, rotate, stacked_losses
 
@@ -138,15 +140,14 @@ def test_stored_messages_teach_what_windows_teach(name, model):
     """Of rollouts with ends in the middle, from messages as they were flown and as windows make them."""
     policy = make_model(name, hidden=8, seed=0, **model)
     settings = DAggerConfig(stride=3, capacity=1000, batch_size=16)
-    flocks = FlockBuffer(
-        FlockingConfig(max_steps=6), settings, 4, 4, [policy], Reynolds(), steps=13, hold_steps=13, seed=0
-    )
-    assert stores_messages(policy)
-    assert flocks.window == 1
-    rollouts = flocks.fly(0.3)
+    spec = RolloutSpec(training_env_factory(FlockingConfig(max_steps=6)), 4, 4, steps=13, seed=0)
+    data = make_buffer(spec, settings, [policy], Reynolds(), hold_steps=13)
+    assert uses_stored_messages(policy)
+    assert data.windows.window == 1
+    rollouts = data.collect(0.3)
     assert bool(rollouts["is_init"][:, policy.window :].any())
-    made_anew = as_windows(rollouts.exclude("messages"), policy.window, stride=3)
-    stored = as_windows(rollouts, 1, stride=1).view(4, 13)[:, policy.window - 1 :: 3].reshape(-1, 1)
+    made_anew = slice_windows(rollouts.exclude("messages"), policy.window, stride=3)
+    stored = slice_windows(rollouts, 1, stride=1).view(4, 13)[:, policy.window - 1 :: 3].reshape(-1, 1)
     receivers = stored["agents", "controlled"][:, -1]
     losses = [imitation_loss(policy, batch, receivers) for batch in (made_anew, stored)]
     torch.testing.assert_close(losses[0], losses[1])
@@ -162,7 +163,7 @@ def test_stored_messages_teach_what_windows_teach(name, model):
     ("name", "model"), [("pair_force", {"layers": 2}), ("modgnn_mlp", {"layers": 2}), ("mpnn", {"layers": 2})]
 )
 def test_learned_messages_are_not_stored(name, model):
-    assert not stores_messages(make_model(name, hidden=8, seed=0, **model))
+    assert not uses_stored_messages(make_model(name, hidden=8, seed=0, **model))
 
 
 @pytest.mark.parametrize(
@@ -214,7 +215,7 @@ def test_velocities_are_hidden_in_the_stated_share_of_windows():
 def test_hidden_velocities_need_windows():
     """Stored messages hold the velocities."""
     policy = make_model("pair_force", seed=0)
-    assert window_of([policy], DAggerConfig()) == 1
-    assert window_of([policy], DAggerConfig(hide_velocity=0.1)) == policy.window == 2
-    assert window_of([policy, make_model("pair_force", seed=1)], DAggerConfig()) == 1
-    assert window_of([policy, make_model("modgnn_mlp", hops=3, seed=0)], DAggerConfig()) == 4
+    assert window_length([policy], DAggerConfig()) == 1
+    assert window_length([policy], DAggerConfig(hide_velocity=0.1)) == policy.window == 2
+    assert window_length([policy, make_model("pair_force", seed=1)], DAggerConfig()) == 1
+    assert window_length([policy, make_model("modgnn_mlp", hops=3, seed=0)], DAggerConfig()) == 4

@@ -12,7 +12,8 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig, MAPPOConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.trainers.collectors.local import FlockCollector
+from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
 from modgnn_rl.trainers.ppo.learner import RECEIVERS, PPOLearner
 
 WORLD = FlockingConfig(max_steps=8)  # rollouts end in the middle of the rounds
@@ -26,9 +27,8 @@ def _learner(name="pair_force", *, model=None, env_config=WORLD, **settings):
 
 
 def _collector(learner, *, env_config=WORLD, steps=STEPS):
-    return FlockCollector(
-        env_config, FLOCKS, AGENTS, (learner.actor, Reynolds.for_env(env_config)), steps=steps, seed=0
-    )
+    spec = RolloutSpec(training_env_factory(env_config), FLOCKS, AGENTS, steps, seed=0)
+    return LocalCollector(spec, (learner.actor, Reynolds.for_env(env_config)))
 
 
 def _weights(module):
