@@ -90,7 +90,7 @@ class Agent:
             InputError: out of turn, or for data that the policy cannot read.
         """
         if self._seen is not None:
-            raise InputError("observe came twice in a step; the order is observe, receive, act, and reset begins anew")
+            raise InputError("observe came twice in a step; the order is observe, receive, act; reset starts over")
         if observation.ndim != 1 or self._features not in (None, len(observation)):
             wanted = "[F]" if self._features is None else [self._features]
             raise InputError(f"the observation of one agent is {wanted}, not {list(observation.shape)}")
@@ -241,12 +241,12 @@ def check_local(policy: ModGNN) -> None:
         if not isinstance(layer, ModGNNLayer):
             raise InputError(
                 f"layer {number} of this policy is a {type(layer).__name__}, which reads all agents at once; only "
-                "layers of ModGNNLayer can be flown agent by agent"
+                "layers of ModGNNLayer can be run agent by agent"
             )
         if layer.start == "repeat":
             raise InputError(
                 f"layer {number} of this policy has start='repeat', for which an agent would have to know what its "
-                "neighbours first saw; only start='mask' and 'zero' can be flown agent by agent"
+                "neighbours first saw; only start='mask' and 'zero' can be run agent by agent"
             )
 
 

@@ -3,7 +3,7 @@
 The unit of all statistics is the episode of a flock: its agents and time steps are not independent, so average over
 them first.
 
-The bootstrap is hierarchical, with two levels (Davison and Hinkley 1997): a resample draws seeds with replacement and,
+The bootstrap is hierarchical, with two levels (Davison and Hinkley 1997): a resample picks seeds with replacement and,
 within each of these, episodes with replacement; with one seed, it is Efron's (1979). The stratified bootstrap of
 Agarwal et al. (2021) differs: it resamples runs within each task and keeps all tasks. Intervals are percentiles of the
 resamples.

@@ -136,7 +136,7 @@ class Zero(nn.Module):
 
 
 def is_equivariant(module: nn.Module) -> bool:
-    """Whether a policy is known to turn with the world: all that its layers are made of says ``is_equivariant``."""
+    """Whether a policy is known to be rotation-equivariant: each part is in a module with ``is_equivariant = True``."""
     parts = [part for part in module.modules() if not list(part.children())]
     inside = {part for holder in module.modules() if _says_so(holder) for part in holder.modules()}
     return all(part in inside or isinstance(part, (nn.Identity, GraphShift)) for part in parts)

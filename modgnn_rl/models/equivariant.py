@@ -1,4 +1,4 @@
-"""Forces of pairs: an f_pre that turns with the world, and vector messages between layers.
+"""Forces of pairs: a rotation-equivariant f_pre, and vector messages between layers.
 
 Everything that such a layer reads and writes is made of 3-vectors and scalars, so that a policy of these layers is
 invariant to translations and equivariant to rotations and reflections, whatever its weights.
@@ -34,7 +34,7 @@ class PairForce(nn.Module):
     With the relative position r u (distance r, unit vector u) and relative velocity w that hop 1 of the Laplacian
     brings (further hops bring sums of such differences, which are treated alike), and the receiver's own velocity v, a
     small network maps the invariants to (a, b, c), and the force is ``a u + b w + c v``. Forces are summed over the
-    neighbours, so that a policy trained at one flock size flies at others.
+    neighbours, so that a policy trained at one flock size works at others.
 
     Behind earlier layers, which put out C vectors and S scalars each, these are compared and combined in the same way:
     their differences, and the receiver's own.

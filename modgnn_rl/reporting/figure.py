@@ -83,7 +83,7 @@ class Drawing:
     wide: str
     """SVG to stand inside a page, in the colours of the page."""
     narrow: str
-    """The same, drawn anew for a phone."""
+    """The same, laid out for a phone."""
     svg: bytes
     """For papers, black on white, letters as outlines."""
     png: bytes

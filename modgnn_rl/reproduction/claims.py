@@ -29,7 +29,7 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class Operand:
-    """One side of a comparison: a model's figure in a world, averaged over its hops where there are several."""
+    """One side of a comparison: a metric of a model in one environment, averaged over its hops if there are several."""
 
     model: str
     hops: tuple[int, ...]
@@ -44,7 +44,7 @@ class Operand:
         return f"{NAMES[self.model]}{hops}{agents}"
 
     def values(self, results: Results) -> NDArray[np.float64] | None:
-        """The figure of all rollouts [S, F]; None where something of it failed or was not flown."""
+        """The metric of all rollouts [S, F]; None if a job failed or was not run."""
         hops = (1,) if self.model == "central" else self.hops
         found = [results.values(ModelVariant(self.model, hop), self.env_config, self.figure) for hop in hops]
         known = [values for values in found if values is not None]

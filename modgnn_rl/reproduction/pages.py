@@ -113,7 +113,7 @@ def _draw_intervals(canvas: Canvas, groups: dict[str, dict[str, Estimate]], refe
 
 
 def _studied(results: Results) -> tuple[dict[str, Table], list[Figure], str]:
-    """A table of errors and one of lost flocks, a row for each model and a column for each world; a figure."""
+    """Tables of errors and leader-lost rates, a row for each model and a column for each environment; a figure."""
     config, study = results.config, results.study
     name = config.study
     if name in ("communication", "layers"):
@@ -164,7 +164,7 @@ def _errors(results: Results, title: str, settings: Mapping[str, str], usual: st
         "Error against the expert's action, m²/s²: interquartile mean over seeds and rollouts with its 95 % interval."
     )
     if rises:
-        caption += " Rise: mean over the other settings, minus the error in the world of training."
+        caption += " Rise: mean over the other settings, minus the error in the training environment."
     best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(settings) + rises), "low")
     header = ["model", *settings, *(["rise"] if rises else [])]
     return Table(title, header, body, f"{caption} {_flown(results)}", best, REFERENCES)
@@ -200,7 +200,7 @@ def _answer(results: Results, settings: Mapping[str, str], usual: str) -> str:
     known = {title: interval.value for title, interval in errors.items() if interval is not None}
     if not known:
         return "Nothing could be measured."
-    text = f"Lowest error in the world of training: {min(known, key=known.__getitem__)}."
+    text = f"Lowest error in the training environment: {min(known, key=known.__getitem__)}."
     rises = {title_of(row): _rise(results, row, settings, usual) for row in variants}
     others = {title: known[title] + rise for title, rise in rises.items() if title in known and np.isfinite(rise)}
     if len(settings) > 2 and others:

@@ -121,7 +121,7 @@ def _validation(results: Results, rows: Sequence[Row]) -> Table:
         average = mean(results, row, VALIDATION, "error")
         body.append([title_of(row), math.nan if paper is None else paper, average, shown(here)])
     caption = (
-        "Mean squared error against the expert's action, per component, m²/s², while the expert flies. Middle: "
+        "Mean squared error against the expert's action, per component, m²/s², on the expert's rollouts. Middle: "
         f"interquartile mean with its 95 % interval over seeds and rollouts. {_about(results, VALIDATION)}"
     )
     header = ["model", "paper", "mean", "middle [95 %]"]

@@ -41,7 +41,7 @@ class Dashboard:
         """Log how numbers [n] are distributed."""
 
     def log_video(self, step: int, name: str, path: Path) -> None:
-        """Show a film, an mp4 file."""
+        """Log a video, an mp4 file."""
 
     def log_table(self, name: str, columns: Sequence[str], rows: Sequence[Sequence[str | float]]) -> None:
         """Show a table; later ones of that name replace it."""
@@ -109,7 +109,7 @@ class Tensorboard(Dashboard):
         self.logger.log_histogram(name, values, step=step, bins="tensorflow")
 
     def log_video(self, step: int, name: str, path: Path) -> None:
-        """Show a film among the images, as a GIF, the only form of film that there is."""
+        """Log a video among the images, as a GIF, the only video format that they can show."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         from modgnn_rl.visualization.video import as_gif
@@ -205,7 +205,7 @@ class Wandb(Dashboard):
         self.logger.log_histogram(name, values, step=step, bins=64)
 
     def log_video(self, step: int, name: str, path: Path) -> None:
-        """Show a film, an mp4 file."""
+        """Log a video, an mp4 file."""
         import wandb
 
         self.logger.log_metrics({name: wandb.Video(str(path), format="mp4")}, step=step)

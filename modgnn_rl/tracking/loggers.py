@@ -1,4 +1,4 @@
-"""The dashboards of a run beside the plain ``metrics.jsonl``, guarded so that training goes on whatever they do."""
+"""The dashboards of a run besides the plain ``metrics.jsonl``; a failing dashboard does not stop training."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ PATIENCE = 13.0  # s; a dashboard that takes longer over anything is turned off
 
 
 class LoggerGroup:
-    """LoggerGroup of which each is turned off by its first exception, or its first long wait, with one warning.
+    """Dashboards, each turned off with a warning by its first exception or its first long wait.
 
-    None of the methods raises, and the other dashboards go on.
+    None of the methods raises, and the other dashboards continue.
 
     Args:
         builders: makes each dashboard, by the name that warnings call it.
@@ -48,7 +48,7 @@ class LoggerGroup:
 
     @property
     def shows_videos(self) -> bool:
-        """Whether any that is on shows films."""
+        """Whether any dashboard that is on shows videos."""
         return any(dashboard.shows_videos for dashboard in self._dashboards.values())
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
@@ -62,7 +62,7 @@ class LoggerGroup:
             self._each(lambda dashboard: dashboard.log_histogram(step, name, finite))
 
     def log_video(self, step: int, name: str, path: Path) -> None:
-        """Show a film, an mp4 file."""
+        """Log a video, an mp4 file."""
         self._each(lambda dashboard: dashboard.log_video(step, name, path))
 
     def log_table(self, name: str, columns: Sequence[str], rows: Sequence[Sequence[str | float]]) -> None:
@@ -94,7 +94,7 @@ class LoggerGroup:
             if name == "wandb":
                 _stop_wandb()
             warnings.warn(
-                f"logger={name} failed and is now off ({one_line(error)}); metrics.jsonl goes on",
+                f"logger={name} failed and is now off ({one_line(error)}); metrics.jsonl continues",
                 RuntimeWarning,
                 stacklevel=5,
             )

@@ -86,7 +86,7 @@ class RunSummary:
 
 
 def training_metrics() -> tuple[str, ...]:
-    """Names of the metrics that training is judged by: the trainers' objectives, and the loss."""
+    """Names of the metrics that measure training progress: the trainers' objectives, and the loss."""
     known = filter(None, map(TRAINERS.peek, TRAINERS))  # an installed package is not imported for this
     return tuple(dict.fromkeys([*filter(None, (entry.options.get("objective") for entry in known)), "loss"]))
 

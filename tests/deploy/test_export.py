@@ -319,7 +319,7 @@ def with_final(f_final: nn.Module) -> ModGNN:
         (with_final(_Remembers()), torch.float32, "differs from the policy by .* more than 1e-05"),
         (with_final(_Chooses()), torch.float32, "a submodule of the policy cannot be exported: "),
         (with_final(nn.Identity()), torch.bfloat16, "float32 or float64, not for observations of torch.bfloat16"),
-        (make_model("central", num_agents=3), torch.float32, "only layers of ModGNNLayer can be flown agent by agent"),
+        (make_model("central", num_agents=3), torch.float32, "only layers of ModGNNLayer can be run agent by agent"),
         (ModGNN(ModGNNLayer(1, start="repeat")), torch.float32, "start='repeat'"),
     ],
 )

@@ -166,7 +166,7 @@ def test_the_first_failure_turns_a_dashboard_off_with_one_warning_and_the_others
     with pytest.warns(RuntimeWarning) as caught:
         use()
     assert [str(warning.message) for warning in caught] == [
-        "logger=fake failed and is now off (the server); metrics.jsonl goes on"
+        "logger=fake failed and is now off (the server); metrics.jsonl continues"
     ]
     assert [name for name, *_ in fake.calls].count(broken) == 1
     assert len(other.calls) == 16

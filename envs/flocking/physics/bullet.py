@@ -121,7 +121,7 @@ class BulletPhysics(TorchPhysics):
         super().step(_to_bullet(target_velocity), push if push is None else _to_bullet(push))
 
     def restore(self, snapshot: Mapping[str, Tensor]) -> None:
-        """Continue from a snapshot in rebuilt worlds, see `modgnn_rl.envs.flocking.physics.engine.Physics.restore`.
+        """Continue from a snapshot in new simulations, see `modgnn_rl.envs.flocking.physics.engine.Physics.restore`.
 
         Trajectories continue bit for bit, also on the floor, except those of agents in contact with each other: Bullet
         loses its record of the contacts, so these continue up to rounding (1e-6 m after a second of pushing).
