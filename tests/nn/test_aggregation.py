@@ -21,64 +21,10 @@ from modgnn_rl.nn.aggregation import NodeInputs, aggregate
 from modgnn_rl.nn.communication import Adjacency, GraphAttention, Laplacian
 from modgnn_rl.nn.graph import EdgeList
 from modgnn_rl.nn.topology import Topology
+from tests.nn.helpers import WIDTH, assert_all_close, edge_lists, numbers, random_edges, random_inputs, results
 
 seeds = st.integers(0, 999)
 few = settings(max_examples=15)
-WIDTH = 3
-
-
-def numbers(*shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64)
-
-
-def random_links(senders: int, receivers: int, share: float, **attributes: Tensor) -> EdgeList:
-    """Links between two different sets of nodes, some of which may have none."""
-    receiver, sender = (torch.rand(receivers, senders) < share).nonzero().unbind(-1)
-    return EdgeList(sender, receiver, senders, receivers, **attributes)
-
-
-links = st.builds(
-    lambda senders, receivers, share, seed: (torch.manual_seed(seed), random_links(senders, receivers, share))[1],
-    senders=st.integers(1, 6),
-    receivers=st.integers(0, 6),
-    share=st.sampled_from([0.0, 0.3, 1.0]),
-    seed=seeds,
-)
-
-
-def held_by(links: EdgeList, **own: Tensor) -> NodeInputs:
-    rows = links.num_senders, links.num_receivers
-    senders, receivers = (numbers(count, WIDTH).requires_grad_() for count in rows)
-    return NodeInputs(senders, receivers, {("own", name): value for name, value in own.items()})
-
-
-def results(
-    links: EdgeList, f_com: nn.Module, f_pre: nn.Module, hop: NodeInputs, kind: str, *, at_once: bool = False
-) -> list[Tensor]:
-    """The aggregate, and gradients for tables and weights; ``at_once`` by plain autograd over all links."""
-    value = aggregate(links, f_com, f_pre, hop, kind, (lambda name, rows: None) if at_once else None)
-    tables = [table for table in (hop.senders, hop.receivers, *hop.own.values()) if table.requires_grad]
-    wanted = tables + [weight for module in (f_com, f_pre) for weight in module.parameters() if weight.requires_grad]
-    scale = torch.linspace(0.5, 1.5, value.numel(), dtype=value.dtype).view_as(value)
-    if not value.requires_grad:
-        return [value, *map(torch.zeros_like, wanted)]
-    return [value, *torch.autograd.grad((value * scale).sum(), wanted, allow_unused=True, materialize_grads=True)]
-
-
-def equal(ours: list[Tensor], theirs: list[Tensor], tolerance: float = 1e-12) -> None:
-    for our, their in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(our, their, rtol=tolerance, atol=tolerance)
-
-
-@pytest.fixture
-def small_blocks(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
-    """Blocks of a few links, none of which are stored for the backward pass."""
-
-    def set_size(size: int) -> None:
-        monkeypatch.setattr(graph, "BLOCK", {"cpu": size})
-        monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", 0)
-
-    return set_size
 
 
 class _OwnNumbers(nn.Module):
@@ -117,39 +63,39 @@ MODULES: dict[str, Callable[[], tuple[nn.Module, nn.Module]]] = {
 @pytest.mark.parametrize("name", MODULES)
 @pytest.mark.parametrize("kind", graph.AGGREGATIONS)
 @settings(max_examples=8)
-@given(links=links, size=st.sampled_from([1, 4, 100]), stored=st.booleans())
+@given(links=edge_lists, size=st.sampled_from([1, 4, 100]), stored=st.booleans())
 def test_blocks_stored_or_not_are_plain_autograd(
     name: str, kind: str, links: EdgeList, size: int, stored: bool
 ) -> None:
     f_com, f_pre = (module.double() for module in MODULES[name]())
     role, arms = torch.randint(5, (links.num_receivers, 1)), numbers(links.num_receivers, 3, 2).requires_grad_()
-    hop = held_by(links, role=role, arms=arms)
+    hop = random_inputs(links, role=role, arms=arms)
     expected = results(links, f_com, f_pre, hop, kind, at_once=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graph, "BLOCK", {"cpu": size})
         patch.setattr(aggregation, "MAX_STORED_EDGES", 1000 if stored else 0)
-        equal(results(links, f_com, f_pre, hop, kind), expected)
+        assert_all_close(results(links, f_com, f_pre, hop, kind), expected)
 
 
 @few
-@given(links=links, size=st.sampled_from([1, 4, 100]))
+@given(links=edge_lists, size=st.sampled_from([1, 4, 100]))
 def test_frozen_weights_and_constant_data_have_no_gradient(links: EdgeList, size: int) -> None:
     f_com, f_pre = nn.Bilinear(WIDTH, WIDTH, WIDTH).double(), tanh_network()
     f_pre[0].requires_grad_(False)  # type: ignore[index]
-    hop = held_by(links)
+    hop = random_inputs(links)
     hop.senders.requires_grad_(False)
     expected = results(links, f_com, f_pre, hop, "sum", at_once=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graph, "BLOCK", {"cpu": size})
         patch.setattr(aggregation, "MAX_STORED_EDGES", 0)
-        equal(results(links, f_com, f_pre, hop, "sum"), expected)
+        assert_all_close(results(links, f_com, f_pre, hop, "sum"), expected)
 
 
 def test_the_backward_pass_draws_the_same_dropout(small_blocks: Callable[[int], None], monkeypatch) -> None:
     torch.manual_seed(0)
-    many = random_links(12, 9, 0.5)
+    many = random_edges(12, 9, 0.5)
     f_pre = nn.Sequential(nn.Dropout(0.5), tanh_network(), nn.Dropout(0.5))
-    hop = held_by(many)
+    hop = random_inputs(many)
     small_blocks(7)
     torch.manual_seed(1)
     value = aggregate(many, Laplacian(), f_pre, hop)
@@ -161,7 +107,7 @@ def test_the_backward_pass_draws_the_same_dropout(small_blocks: Callable[[int], 
     torch.manual_seed(1)
     stored = aggregate(many, Laplacian(), f_pre, hop)
     theirs = torch.autograd.grad(stored.square().sum(), (hop.senders, hop.receivers, *f_pre.parameters()))
-    equal([value, *ours], [stored, *theirs])
+    assert_all_close([value, *ours], [stored, *theirs])
     assert not torch.allclose(value, aggregate(many, Laplacian(), f_pre, hop))  # drops others now
 
 
@@ -171,7 +117,7 @@ def test_autocast_holds_in_the_backward_pass(
 ) -> None:
     """Also where the same weights are used with and without recomputation under one autocast, which caches casts."""
     torch.manual_seed(0)
-    many = random_links(12, 9, 0.5)
+    many = random_edges(12, 9, 0.5)
     f_pre = tanh_network().float()
     senders, receivers = torch.randn(12, WIDTH).requires_grad_(), torch.randn(9, WIDTH).requires_grad_()
     wanted = (senders, receivers, *f_pre.parameters())
@@ -201,18 +147,18 @@ def test_weights_lent_to_a_module_get_the_gradients(small_blocks: Callable[[int]
     torch.manual_seed(0)
     f_com, f_pre = nn.Bilinear(WIDTH, WIDTH, WIDTH).double(), tanh_network()
     both = _Pair(f_com, f_pre)
-    many = random_links(8, 7, 0.5)
-    hop = held_by(many)
+    many = random_edges(8, 7, 0.5)
+    hop = random_inputs(many)
     lent = {name: numbers(*value.shape).requires_grad_() for name, value in both.named_parameters()}
     at_once = torch.func.functional_call(both, lent, (many, hop, lambda name, rows: None))
     expected = torch.autograd.grad(at_once.square().sum(), tuple(lent.values()))
     small_blocks(5)
     value = torch.func.functional_call(both, lent, (many, hop))
-    equal([value, *torch.autograd.grad(value.square().sum(), tuple(lent.values()))], [at_once, *expected])
+    assert_all_close([value, *torch.autograd.grad(value.square().sum(), tuple(lent.values()))], [at_once, *expected])
     weights = TensorDict(lent, []).unflatten_keys(".")
     with weights.to_module(both):
         value = both(many, hop)
-    equal([value, *torch.autograd.grad(value.square().sum(), tuple(lent.values()))], [at_once, *expected])
+    assert_all_close([value, *torch.autograd.grad(value.square().sum(), tuple(lent.values()))], [at_once, *expected])
 
 
 class _Pair(nn.Module):
@@ -230,13 +176,13 @@ def test_a_module_that_changes_as_it_runs_is_run_again_as_it_was(
     """Spectral normalisation takes a step of its power iteration at every call, that is, for every block."""
     torch.manual_seed(0)
     f_pre = nn.Sequential(parametrizations.spectral_norm(nn.Linear(WIDTH, 4)), nn.Tanh()).double()
-    many, other = random_links(8, 7, 0.5), copy.deepcopy(f_pre)
-    hop = held_by(many)
+    many, other = random_edges(8, 7, 0.5), copy.deepcopy(f_pre)
+    hop = random_inputs(many)
     small_blocks(5)
     ours = results(many, Laplacian(), f_pre, hop, "sum")
     monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", 1000)
-    equal(ours, results(many, Laplacian(), other, hop, "sum"))
-    equal(list(f_pre.buffers()), list(other.buffers()))
+    assert_all_close(ours, results(many, Laplacian(), other, hop, "sum"))
+    assert_all_close(list(f_pre.buffers()), list(other.buffers()))
 
 
 class _Twice(nn.Module):
@@ -260,12 +206,12 @@ def test_what_f_com_and_f_pre_share_gets_both_gradients(what: str, small_blocks:
         f_pre.linear = f_com.linear
     else:
         f_pre.linear.weight = f_com.linear.weight
-    many = random_links(8, 7, 0.5)
-    hop = held_by(many)
+    many = random_edges(8, 7, 0.5)
+    hop = random_inputs(many)
     weights = dict(f_com.named_parameters())
     expected = results(many, f_com, f_pre, hop, "sum", at_once=True)
     small_blocks(5)
-    equal(results(many, f_com, f_pre, hop, "sum"), expected)
+    assert_all_close(results(many, f_com, f_pre, hop, "sum"), expected)
     assert all(value is weights[name] for name, value in f_com.named_parameters())
 
 
@@ -274,11 +220,11 @@ def test_learned_weights_and_features_of_links_get_gradients(
     limit: int, small_blocks: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     torch.manual_seed(0)
-    bare = random_links(8, 7, 0.5)
+    bare = random_edges(8, 7, 0.5)
     weight, feature = numbers(len(bare)).requires_grad_(), numbers(len(bare), 2).requires_grad_()
     many = EdgeList(bare.sender, bare.receiver, 8, 7, weight, feature)
     f_com = TensorDictModule(_Concatenated(), ["sender", ("edge", "weight"), ("edge", "feature")], ["y"])
-    hop, f_pre = held_by(many), tanh_network(WIDTH + 3)
+    hop, f_pre = random_inputs(many), tanh_network(WIDTH + 3)
     at_once = aggregate(many, f_com, f_pre, hop, record=lambda name, rows: None)
     small_blocks(5)
     monkeypatch.setattr(aggregation, "MAX_STORED_EDGES", limit)
@@ -286,7 +232,7 @@ def test_learned_weights_and_features_of_links_get_gradients(
     ours, theirs = (
         torch.autograd.grad(total.square().sum(), (weight, feature, *f_pre.parameters())) for total in (value, at_once)
     )
-    equal([value, *ours], [at_once, *theirs])
+    assert_all_close([value, *ours], [at_once, *theirs])
 
 
 class _Concatenated(nn.Module):

@@ -23,16 +23,13 @@ from modgnn_rl.nn.communication import (
 )
 from modgnn_rl.nn.graph import DenseGraph, Graph
 from modgnn_rl.nn.topology import Topology
+from tests.nn.helpers import numbers
 
 seeds = st.integers(0, 999)
 shares = st.sampled_from([0.0, 0.4, 1.0])
 forms = st.sampled_from(["edges", "dense"])
 few = settings(max_examples=15)
 STEPS, AGENTS = 5, 4
-
-
-def numbers(*shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64)
 
 
 def random_mask(*shape: int, agents: int = AGENTS, share: float = 0.5) -> Tensor:

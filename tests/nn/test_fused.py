@@ -18,63 +18,10 @@ from modgnn_rl.nn.aggregation import NodeInputs, aggregate
 from modgnn_rl.nn.communication import Adjacency, Laplacian
 from modgnn_rl.nn.graph import EdgeList
 from modgnn_rl.nn.topology import Topology
+from tests.nn.helpers import WIDTH, assert_all_close, edge_lists, numbers, random_edges, random_inputs, results
 
 seeds = st.integers(0, 999)
 few = settings(max_examples=15)
-WIDTH = 3
-
-
-def numbers(*shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64)
-
-
-def random_links(senders: int, receivers: int, share: float, **attributes: Tensor) -> EdgeList:
-    """Links between two different sets of nodes, some of which may have none."""
-    receiver, sender = (torch.rand(receivers, senders) < share).nonzero().unbind(-1)
-    return EdgeList(sender, receiver, senders, receivers, **attributes)
-
-
-links = st.builds(
-    lambda senders, receivers, share, seed: (torch.manual_seed(seed), random_links(senders, receivers, share))[1],
-    senders=st.integers(1, 6),
-    receivers=st.integers(0, 6),
-    share=st.sampled_from([0.0, 0.3, 1.0]),
-    seed=seeds,
-)
-
-
-def held_by(links: EdgeList, **own: Tensor) -> NodeInputs:
-    rows = links.num_senders, links.num_receivers
-    senders, receivers = (numbers(count, WIDTH).requires_grad_() for count in rows)
-    return NodeInputs(senders, receivers, {("own", name): value for name, value in own.items()})
-
-
-def results(
-    links: EdgeList, f_com: nn.Module, f_pre: nn.Module, hop: NodeInputs, kind: str, *, at_once: bool = False
-) -> list[Tensor]:
-    """The aggregate, and gradients for tables and weights; ``at_once`` by plain autograd over all links."""
-    value = aggregate(links, f_com, f_pre, hop, kind, (lambda name, rows: None) if at_once else None)
-    tables = [table for table in (hop.senders, hop.receivers, *hop.own.values()) if table.requires_grad]
-    wanted = tables + [weight for module in (f_com, f_pre) for weight in module.parameters() if weight.requires_grad]
-    scale = torch.linspace(0.5, 1.5, value.numel(), dtype=value.dtype).view_as(value)
-    if not value.requires_grad:
-        return [value, *map(torch.zeros_like, wanted)]
-    return [value, *torch.autograd.grad((value * scale).sum(), wanted, allow_unused=True, materialize_grads=True)]
-
-
-def equal(ours: list[Tensor], theirs: list[Tensor], tolerance: float = 1e-12) -> None:
-    for our, their in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(our, their, rtol=tolerance, atol=tolerance)
-
-
-@pytest.fixture
-def small_blocks(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
-    """Blocks of a few links."""
-
-    def set_size(size: int) -> None:
-        monkeypatch.setattr(graph, "BLOCK", {"cpu": size})
-
-    return set_size
 
 
 class _Scale(nn.Module):
@@ -115,22 +62,22 @@ networks = st.builds(
 @pytest.mark.parametrize("f_com", [Laplacian(), Adjacency()])
 @pytest.mark.parametrize("kind", ["sum", "mean"])
 @settings(max_examples=60)
-@given(f_pre=networks, links=links, size=st.sampled_from([1, 4, 100]))
+@given(f_pre=networks, links=edge_lists, size=st.sampled_from([1, 4, 100]))
 def test_rewrites_are_exact(f_com: nn.Module, kind: str, f_pre: nn.Module, links: EdgeList, size: int) -> None:
-    hop = held_by(links)
+    hop = random_inputs(links)
     expected = results(links, f_com, f_pre, hop, kind, at_once=True)
     assert fused.fuse(links, f_com, f_pre) is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graph, "BLOCK", {"cpu": size})
-        equal(results(links, f_com, f_pre, hop, kind), expected)
+        assert_all_close(results(links, f_com, f_pre, hop, kind), expected)
 
 
 @pytest.mark.parametrize("f_com", [Laplacian(), Adjacency()])
 def test_gradients_of_a_rewrite_by_finite_differences(f_com: nn.Module, small_blocks: Callable[[int], None]) -> None:
     torch.manual_seed(0)
-    many, f_pre = random_links(6, 5, 0.5), relu_network([4, 4, 2], [True] * 3, True, (False, False), False)
+    many, f_pre = random_edges(6, 5, 0.5), relu_network([4, 4, 2], [True] * 3, True, (False, False), False)
     small_blocks(5)
-    hop = held_by(many)
+    hop = random_inputs(many)
 
     def value(senders: Tensor, receivers: Tensor, *weights: Tensor) -> Tensor:
         return aggregate(many, f_com, f_pre, NodeInputs(senders, receivers, {}))
@@ -180,16 +127,16 @@ OTHERS: dict[str, Callable[[], tuple[nn.Module, nn.Module]]] = {
 def test_other_modules_are_not_rewritten(name: str, small_blocks: Callable[[int], None]) -> None:
     torch.manual_seed(0)
     f_com, f_pre = (module.double() for module in OTHERS[name]())
-    many = random_links(6, 5, 0.5)
+    many = random_edges(6, 5, 0.5)
     assert fused.fuse(many, f_com, f_pre) is None
-    hop = held_by(many)
+    hop = random_inputs(many)
     expected = results(many, f_com, f_pre, hop, "sum", at_once=True)
     small_blocks(5)
-    equal(results(many, f_com, f_pre, hop, "sum"), expected)
+    assert_all_close(results(many, f_com, f_pre, hop, "sum"), expected)
 
 
 def test_weighted_links_and_autocast_are_not_rewritten() -> None:
-    bare = random_links(6, 5, 0.5)
+    bare = random_edges(6, 5, 0.5)
     f_pre = nn.Sequential(nn.Linear(WIDTH, 4), nn.ReLU(), nn.Linear(4, 2))
     weighted = EdgeList(bare.sender, bare.receiver, 6, 5, torch.ones(len(bare)))
     assert fused.fuse(bare, Laplacian(), f_pre) is not None
@@ -212,4 +159,4 @@ def test_a_rewritten_policy_acts_and_learns_as_one_with_a_hook() -> None:
     rewritten = outputs()
     for hop in f_pre:
         hop.register_forward_hook(lambda module, inputs, output: None)
-    equal(rewritten, outputs())
+    assert_all_close(rewritten, outputs())

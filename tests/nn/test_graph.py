@@ -17,6 +17,7 @@ from modgnn_rl.nn import graph, topology
 from modgnn_rl.nn.communication import MessagePassing
 from modgnn_rl.nn.graph import DenseGraph, EdgeList
 from modgnn_rl.nn.topology import Topology
+from tests.nn.helpers import numbers
 
 seeds = st.integers(0, 999)
 shares = st.sampled_from([0.0, 0.4, 1.0])
@@ -29,10 +30,6 @@ def random_mask(graphs: int, receivers: int, senders: int, share: float, seed: i
 
 
 masks = st.builds(random_mask, st.integers(1, 3), st.integers(1, 4), st.integers(1, 4), shares, seeds)
-
-
-def numbers(*shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64)
 
 
 def links_of(mask: Tensor, **attributes: Tensor) -> EdgeList:

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.errors import InputError
+from tests.nn.helpers import dense, random_window, run
 
 FEATURES, AGENTS, STEPS = 2, 4, 5
 ACTION = ("agents", "action")
@@ -20,32 +20,6 @@ ACTION = ("agents", "action")
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
-
-
-def numbers(*shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64)
-
-
-def dense(inputs: int, outputs: int) -> nn.Module:
-    return nn.Sequential(nn.Linear(inputs, 4), nn.Tanh(), nn.Linear(4, outputs))
-
-
-def random_window(*batch: int) -> TensorDict:
-    shape = (*batch, AGENTS, AGENTS)
-    return TensorDict(
-        {
-            "agents": {"observation": numbers(*batch, AGENTS, FEATURES), "goal": numbers(*batch, AGENTS, 1)},
-            "adjacency": (torch.rand(shape) < 0.5) & ~torch.eye(AGENTS, dtype=torch.bool),
-            "weight": numbers(*shape),
-            "feature": numbers(*shape, 3),
-        },
-        batch,
-    )
-
-
-def run(policy: nn.Module, data: TensorDict, *receivers: Tensor) -> TensorDict:
-    with set_recurrent_mode(True):
-        return policy(data.clone(), *receivers)
 
 
 def full_policy() -> ModGNN:

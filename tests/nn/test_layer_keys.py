@@ -17,6 +17,7 @@ from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.communication import Adjacency, GraphAttention, Laplacian
 from modgnn_rl.nn.topology import Topology
+from tests.nn.helpers import dense, random_window, run
 
 FEATURES, AGENTS, STEPS = 2, 4, 5
 ACTION = ("agents", "action")
@@ -25,14 +26,6 @@ ACTION = ("agents", "action")
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
-
-
-def numbers(*shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64)
-
-
-def dense(inputs: int, outputs: int) -> nn.Module:
-    return nn.Sequential(nn.Linear(inputs, 4), nn.Tanh(), nn.Linear(4, outputs))
 
 
 class _Concatenated(nn.Module):
@@ -44,24 +37,6 @@ class _Concatenated(nn.Module):
 
     def forward(self, *parts: Tensor) -> Tensor:
         return self.network(torch.cat(parts, -1))
-
-
-def random_window(*batch: int) -> TensorDict:
-    shape = (*batch, AGENTS, AGENTS)
-    return TensorDict(
-        {
-            "agents": {"observation": numbers(*batch, AGENTS, FEATURES), "goal": numbers(*batch, AGENTS, 1)},
-            "adjacency": (torch.rand(shape) < 0.5) & ~torch.eye(AGENTS, dtype=torch.bool),
-            "weight": numbers(*shape),
-            "feature": numbers(*shape, 3),
-        },
-        batch,
-    )
-
-
-def run(policy: nn.Module, data: TensorDict, *receivers: Tensor) -> TensorDict:
-    with set_recurrent_mode(True):
-        return policy(data.clone(), *receivers)
 
 
 # What keyed submodules read.

@@ -17,16 +17,13 @@ from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.communication import GraphAttention, MessagePassing
 from modgnn_rl.nn.topology import FORMS
+from tests.nn.helpers import numbers
 
 FEATURES, STEPS = 2, 5
 STARTS = ("mask", "zero", "repeat")
 NO_NUMBERS = (torch.nan, torch.inf, -torch.inf)
 seeds = st.integers(0, 999)
 forms = st.sampled_from(FORMS)
-
-
-def numbers(*shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64)
 
 
 def relu_network(inputs: int, outputs: int) -> nn.Module:

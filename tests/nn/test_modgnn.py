@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
+from tests.nn.helpers import dense
 
 FEATURES, WIDTH = 3, 4
 STARTS = ("mask", "zero", "repeat")
@@ -31,10 +32,6 @@ class _Pairwise(nn.Module):
 
     def forward(self, sender: Tensor, receiver: Tensor) -> Tensor:
         return self.linear(torch.cat((sender, receiver), -1)).tanh()
-
-
-def dense(inputs: int, outputs: int) -> nn.Module:
-    return nn.Sequential(nn.Linear(inputs, 5), nn.Tanh(), nn.Linear(5, outputs))
 
 
 def full_layer(hops: int, start: str = "mask", inputs: int = FEATURES, shared: bool = False) -> ModGNNLayer:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -22,13 +22,10 @@ from modgnn_rl.envs.flocking.expert import LocalReynolds
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.factory import make_model
 from modgnn_rl.nn.primer import RecurrentStatePrimer, missing
+from tests.nn.helpers import dense
 
 FLOCKS, AGENTS = 3, 4
 ACTION = ("agents", "action")
-
-
-def dense(inputs: int, outputs: int) -> nn.Module:
-    return nn.Sequential(nn.Linear(inputs, 5), nn.Tanh(), nn.Linear(5, outputs))
 
 
 def two_layers() -> ModGNN:

@@ -22,6 +22,7 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl import ModGNN, ModGNNLayer
 from modgnn_rl.nn import aggregation, graph, topology
 from modgnn_rl.nn.communication import GraphAttention, MessagePassing
+from tests.nn.helpers import numbers
 
 FEATURES, AGENTS, STEPS = 2, 4, 4
 ACTION = ("agents", "action")
@@ -31,10 +32,6 @@ FORMS = pytest.mark.parametrize("form", ["edges", "dense"])
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
-
-
-def numbers(*shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64)
 
 
 def network(inputs: int, outputs: int, between: type[nn.Module] = nn.Tanh) -> nn.Module:
