@@ -1,15 +1,15 @@
-"""DAgger on a VMAS scenario, with an expert of one's own: robots that pass each other without a collision.
+"""DAgger on a VMAS scenario with a custom expert: robots that pass each other without colliding.
 
     pip install vmas
     python examples/imitate_on_vmas.py
 
-In VMAS' "navigation", each robot has a goal and loses reward for touching another. The expert below sees everybody: it
-steers for its goal, and keeps to the right of whoever is near, whose velocity and goal it knows. The policy hears of
-these from its neighbours only, one step late. The mixture of both flies, the expert labels every state, and the policy
-learns from all of them. Its error falls from 0.85 to 0.004, and its return rises from -0.07 to the expert's, 1.01; with
-``--hops 0`` nobody hears anybody, and the return is -1.03.
+In VMAS' "navigation", each robot has a goal and is penalised for collisions. The expert below sees all robots: it
+steers towards its goal and keeps to the right of robots nearby, whose velocity and goal it knows. The policy receives
+these from its neighbours only, one step late. A mixture of both acts, the expert labels every state, and the policy
+learns from all of them. Its error falls from 0.85 to 0.004, and its return rises from -0.07 to 1.01, the expert's;
+without communication (``--hops 0``) the return is -1.03.
 
-The group of agents is called ``robots`` here, to show where the keys are given.
+The group of agents is called ``robots`` here, to show where the keys are set.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from modgnn_rl.trainers.collectors.windows import slice_windows
 from modgnn_rl.trainers.imitation.loss import imitation_loss
 
 OBSERVATION, ACTION, EXPERT = ("robots", "observation"), ("robots", "action"), ("robots", "expert")
-COMM_RANGE, REACH = 1.0, 0.4  # m; who is heard, and who is made way for
+COMM_RANGE, REACH = 1.0, 0.4  # m; of communication, and of evasion
 
 
 def neighbours(observation: Tensor) -> Tensor:
@@ -42,7 +42,7 @@ def neighbours(observation: Tensor) -> Tensor:
 
 
 def make_env(num_envs: int, num_agents: int, steps: int, seed: int) -> TransformedEnv:
-    """VMAS' navigation: position, velocity and offset from the goal are observed, but no rays."""
+    """VMAS' navigation, observed without rays: position, velocity and offset from the goal."""
     robots = {"robots": [f"agent_{number}" for number in range(num_agents)]}
     env = VmasEnv("navigation", num_envs=num_envs, seed=seed, group_map=robots, n_agents=num_agents, shared_rew=False)
     return TransformedEnv(
@@ -57,7 +57,7 @@ def make_env(num_envs: int, num_agents: int, steps: int, seed: int) -> Transform
 
 
 def keep_right(observation: Tensor) -> Tensor:
-    """The expert: accelerations [*B, N, 2] towards the goals, away from and to the right of others that are near."""
+    """The expert: accelerations [*B, N, 2] towards the goals, away from and to the right of robots nearby."""
     position, velocity, offset = observation.split(2, -1)
     apart = position.unsqueeze(-2) - position.unsqueeze(-3)
     distance = apart.norm(dim=-1, keepdim=True).clamp(min=1e-3)
@@ -69,7 +69,7 @@ def keep_right(observation: Tensor) -> Tensor:
 
 
 def make_policy(hops: int, hidden: int = 64) -> ModGNN:
-    """Networks for what a robot knows itself, without its position, for what each neighbour says, and for the sum."""
+    """ModGNN with networks of a robot's own velocity and goal, of the messages of each hop, and of their sum."""
     own = nn.Sequential(HidePosition(), mlp(6, hidden, hidden))
     f_pre = [own, *(mlp(6, hidden, hidden) for _ in range(hops))]
     f_final = nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2), nn.Hardtanh())
@@ -85,13 +85,13 @@ class HidePosition(nn.Module):
 
 
 @torch.no_grad()
-def rollout(pilot: TensorDictModuleBase, num_envs: int, num_agents: int, steps: int) -> tuple[float, float]:
-    """Error of the pilot's actions against the expert's, and return of a robot, on episodes of the pilot's own."""
+def rollout(policy: TensorDictModuleBase, num_envs: int, num_agents: int, steps: int) -> tuple[float, float]:
+    """Error of a policy's actions against the expert's, and return of a robot, in closed loop."""
     env = make_env(num_envs, num_agents, steps, seed=1)
-    primer = get_primers_from_module(pilot, warn=False)
+    primer = get_primers_from_module(policy, warn=False)
     if primer is not None:
         env.append_transform(primer)
-    rollouts = env.rollout(steps, pilot, break_when_any_done=False)
+    rollouts = env.rollout(steps, policy, break_when_any_done=False)
     difference = rollouts[ACTION] - keep_right(rollouts[OBSERVATION])
     ended = rollouts["next", "done"].cumsum(1) - rollouts["next", "done"].long() > 0
     reward = torch.where(ended.unsqueeze(-1), 0.0, rollouts["next", "robots", "reward"])
@@ -127,15 +127,15 @@ def main(
     )
     buffer = ReplayBuffer(storage=LazyTensorStorage(num_envs * steps * rounds), batch_size=256)
     optimiser = torch.optim.Adam(policy.parameters(), lr=1e-3)
-    everybody = torch.ones(256, num_agents, dtype=torch.bool)
+    all_robots = torch.ones(256, num_agents, dtype=torch.bool)
 
     for number, rollouts in enumerate(collector):
-        mixture.share = 0.5 ** (number + 1)  # the expert's in the next round
+        mixture.beta = 0.5 ** (number + 1)  # probability that the expert acts in the next round
         data = rollouts.select(*policy.in_keys, EXPERT, strict=False)
         buffer.extend(slice_windows(data, policy.window, stride=1))
         losses = []
         for _ in range(updates):
-            loss = imitation_loss(policy, buffer.sample(), everybody, expert_action=EXPERT)
+            loss = imitation_loss(policy, buffer.sample(), all_robots, expert_action=EXPERT)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

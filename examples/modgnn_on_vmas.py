@@ -1,12 +1,12 @@
-"""ModGNN on VMAS, trained with TorchRL's MAPPO: agents that find together although each hears only who is near.
+"""ModGNN on VMAS, trained with TorchRL's MAPPO: agents that gather although each communicates with near ones only.
 
     pip install vmas
     python examples/modgnn_on_vmas.py
 
-What it takes to use ModGNN in an environment with positions: a transform that makes the adjacency, the names of the
-keys, and the messages as recurrent state, which the collector sees to. In VMAS' "flocking", agents are rewarded for
-coming closer to one another. Here a robot knows its own velocity, and what its neighbours said one step ago: in ten
-iterations the return of an episode rises from -0.8 to 0.9, and with ``--hops 0`` nobody finds anybody.
+ModGNN in an environment with positions needs a transform that computes the adjacency, the names of the keys, and the
+messages as recurrent state, which the collector adds. In VMAS' "flocking", agents are rewarded for moving closer to
+one another. Here an agent knows its own velocity and its neighbours' messages of the last step: in ten iterations the
+return of an episode rises from -0.8 to 0.9; without communication (``--hops 0``) the agents do not gather.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def neighbours(observation: Tensor) -> Tensor:
 
 
 def make_env(num_envs: int, num_agents: int, steps: int, seed: int) -> TransformedEnv:
-    """VMAS' flocking, of whose observations position and velocity are kept, with an adjacency."""
+    """VMAS' flocking, observed as position and velocity, with an adjacency."""
     env = VmasEnv("flocking", num_envs=num_envs, seed=seed, n_agents=num_agents, n_obstacles=0, collision_reward=0.0)
     return TransformedEnv(
         env,
@@ -62,7 +62,7 @@ def mlp(inputs: int, hidden: int) -> nn.Sequential:
 
 
 def make_actor(env: EnvBase, hops: int, hidden: int = 32) -> ProbabilisticActor:
-    """ModGNN as a Gaussian policy. Of a neighbour it sees relative position and velocity (f_com is the Laplacian)."""
+    """ModGNN as a Gaussian policy; it sees neighbours' relative positions and velocities (f_com is the Laplacian)."""
     f_pre = [nn.Sequential(Velocity(), mlp(2, hidden)), *(mlp(4, hidden) for _ in range(hops))]
     f_final = nn.Sequential(nn.ReLU(), nn.Linear(hidden, 4))
     layer = ModGNNLayer(hops, f_pre=f_pre, f_final=f_final)
@@ -79,7 +79,7 @@ def make_actor(env: EnvBase, hops: int, hidden: int = 32) -> ProbabilisticActor:
 
 
 def make_critic(num_agents: int) -> TensorDictModule:
-    """A central critic, which sees all positions; only the training needs it."""
+    """A central critic, which sees all positions; it is needed in training only."""
     network = MultiAgentMLP(4, 1, num_agents, centralized=True, share_params=True, depth=2, num_cells=64)
     return TensorDictModule(network, [OBSERVATION], [("agents", "state_value")])
 
@@ -118,7 +118,7 @@ def main(
         total_frames=num_envs * steps * iterations,
         auto_register_policy_transforms=True,  # makes the messages recurrent state of the environment
     )
-    # One item is one environment's window of steps: TorchRL's losses run recurrent policies over windows.
+    # An item is a window of steps of one environment: TorchRL's losses run recurrent policies over windows.
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(num_envs), sampler=SamplerWithoutReplacement(), batch_size=max(1, num_envs // 4)
     )

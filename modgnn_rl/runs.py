@@ -31,14 +31,14 @@ def main(config: RunsConfig) -> None:
 
 
 def show_runs(config: RunsConfig, width: int = 100) -> str:
-    """What the command prints.
+    """The text that the command prints.
 
     Args:
-        config: what is asked for.
-        width: of the terminal.
+        config: settings of the command.
+        width: of the terminal, in characters.
 
     Raises:
-        InputError: there is no such folder or run, or nothing to compare.
+        InputError: no such folder or run, or nothing to compare.
     """
     root = Path(config.runs)
     if config.compare is not None:
@@ -47,7 +47,7 @@ def show_runs(config: RunsConfig, width: int = 100) -> str:
         text = compare(runs)
         return _as_json({"settings": differing_settings(runs), "runs": runs}) if config.format == "json" else text
     if not root.is_dir():
-        raise InputError(f"there is no folder {root}: give the one that holds the runs, as in runs=runs")
+        raise InputError(f"the folder {root} does not exist: give the one that contains the runs, as in runs=runs")
     runs = [summarise_run(path, name) for name, path in _named(root).items()]
     runs = [run for run in runs if config.state is None or run.state in as_list(config.state)]
     runs.sort(key=lambda run: sort_key(run, config.sort))
@@ -57,15 +57,15 @@ def show_runs(config: RunsConfig, width: int = 100) -> str:
 
 
 def find_run(part: str, root: Path) -> RunSummary:
-    """Read the run, or the one of several policies of a run, that is meant.
+    """Find a run, or one of several policies of a run, by its folder or a unique part of its name.
 
     Args:
-        part: a run folder, or what only one name in ``root`` holds: of a run or, if of none, of a policy, which is
-            ``<run>/<policy>``.
-        root: where runs are.
+        part: a run folder, or a part of the name of one run in ``root``; if no run matches, of one policy, whose name
+            is ``<run>/<policy>``.
+        root: the folder that contains the runs.
 
     Raises:
-        InputError: no run, several runs, or one that cannot be read.
+        InputError: no run or several runs match, or the run cannot be read.
     """
     names, folder = _named(root), Path(part)
     if (folder / "config.yaml").is_file():
@@ -79,17 +79,17 @@ def find_run(part: str, root: Path) -> RunSummary:
         policies = [policy for name, path in names.items() for policy in summarise_run(path, name).policies]
         found = [policy for policy in policies if part in policy.name]
     if not found:
-        raise InputError(f"no run in {root} has {part!r} in its name: python -m modgnn_rl.runs lists what there is")
+        raise InputError(f"no run in {root} has {part!r} in its name: python -m modgnn_rl.runs lists all")
     if len(found) > 1:
         several = ", ".join(run.name for run in found[:4]) + (", ..." if len(found) > 4 else "")
-        raise InputError(f"{len(found)} runs have {part!r} in their names ({several}): write more of the one you mean")
+        raise InputError(f"{len(found)} runs have {part!r} in their names ({several}): give a longer part of the name")
     if not found[0].config:
         raise InputError(f"{found[0].path} cannot be compared ({found[0].problem}): leave it out")
     return found[0]
 
 
 def _named(root: Path) -> dict[str, Path]:
-    """The run folders in a folder by their names below it."""
+    """The run folders in a folder by their relative names."""
     return {path.absolute().name if path == root else str(path.relative_to(root)): path for path in find_runs(root)}
 
 
@@ -98,7 +98,7 @@ def _as_json(found: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON holds of a summary: all but the settings."""
+    """What JSON contains of a summary: all but the settings."""
     if isinstance(value, RunSummary):
         return {entry.name: getattr(value, entry.name) for entry in dataclasses.fields(value) if entry.name != "config"}
     return str(value)

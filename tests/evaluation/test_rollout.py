@@ -15,30 +15,31 @@ from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import evaluate, reference_policies, rollout
 from modgnn_rl.evaluation.table import evaluation_markdown, read_tables, summarise_rollouts
+from modgnn_rl.registry import METRICS
 
-FLIGHT = {"num_agents": 6, "num_flocks": 4, "steps": 40, "seed": 3}
+ROLLOUT = {"num_agents": 6, "num_flocks": 4, "steps": 40, "seed": 3}
 
 
 @pytest.fixture(scope="module")
 def rollouts():
-    return evaluate({"gcn": make_model("gcn", seed=0)}, FlockingConfig(), **FLIGHT)
+    return evaluate({"gcn": make_model("gcn", seed=0)}, FlockingConfig(), **ROLLOUT)
 
 
-def test_reference_rows_have_the_errors_they_must_have(rollouts):
+def test_reference_policies_have_the_errors_they_must_have(rollouts):
     assert rollouts["expert"]["error"].max() == 0
     assert (rollouts["zero action"]["error"] > rollouts["local expert (2 hops)"]["error"]).all()
     # The expert is clipped to the ball of 0.92 m/s and mostly on its surface: doing nothing scores |u|^2 / 3.
     assert 0.2 < float(rollouts["zero action"]["error"].mean()) <= 0.92**2 / 3
 
 
-def test_the_flight_is_fixed_by_its_seed(rollouts):
-    again = rollout(make_model("gcn", seed=0), FlockingConfig(), **FLIGHT)
+def test_equal_seeds_give_equal_rollouts(rollouts):
+    again = rollout(make_model("gcn", seed=0), FlockingConfig(), **ROLLOUT)
     assert torch.equal(again["error"], rollouts["gcn"]["error"])
     assert torch.equal(again["min_distance"], rollouts["gcn"]["min_distance"])
 
 
-def test_all_rows_have_the_same_starts_and_leaders():
-    """In the first step nothing has been flown yet, and the leader listens to nobody."""
+def test_all_policies_have_the_same_starts_and_leaders():
+    """The first observations are equal, and so is the leader at every step, which ignores the others."""
     seen = {}
 
     class Spy(TensorDictSequential):
@@ -47,7 +48,7 @@ def test_all_rows_have_the_same_starts_and_leaders():
             return super().forward(tensordict)
 
     for policy in reference_policies(FlockingConfig()).values():
-        rollout(Spy(policy), FlockingConfig(), **FLIGHT)
+        rollout(Spy(policy), FlockingConfig(), **ROLLOUT)
     first, *others = seen.values()
     assert len(others) == 3
     for other in others:
@@ -56,25 +57,25 @@ def test_all_rows_have_the_same_starts_and_leaders():
             assert torch.equal(mine[:, 0], theirs[:, 0])
 
 
-def test_a_policy_flies_the_same_in_both_physics():
+def test_a_policy_acts_the_same_in_both_physics():
     policy = make_model("pair_force", seed=0)
-    in_torch, in_bullet = (rollout(policy, FlockingConfig(physics=name), **FLIGHT) for name in ("torch", "bullet"))
+    in_torch, in_bullet = (rollout(policy, FlockingConfig(physics=name), **ROLLOUT) for name in ("torch", "bullet"))
     for name in ("error", "leader_distance", "cohesion", "separation", "min_distance", "reward"):
         torch.testing.assert_close(in_bullet[name], in_torch[name], rtol=1e-3, atol=1e-4)
     assert torch.equal(in_bullet["leader_lost"], in_torch["leader_lost"])
 
 
-def test_flights_leave_no_physics_behind(monkeypatch):
+def test_rollouts_close_their_physics(monkeypatch):
     """Each flock in PyBullet holds a client until its environment is closed."""
     closed = []
     monkeypatch.setattr(TorchPhysics, "close", lambda physics: closed.append(physics))
-    rollout(make_model("gcn", seed=0), FlockingConfig(), **FLIGHT)
+    rollout(make_model("gcn", seed=0), FlockingConfig(), **ROLLOUT)
     assert len(closed) == 1
 
 
-def test_truth_is_measured_where_sensors_are_noisy():
+def test_metrics_are_of_the_true_state_with_noisy_sensors():
     quiet, noisy = (
-        rollout(Reynolds(action=("agents", "action"), observation=key), config, **FLIGHT)
+        rollout(Reynolds(action=("agents", "action"), observation=key), config, **ROLLOUT)
         for key, config in (
             (("agents", "observation"), FlockingConfig()),
             (("agents", "state"), FlockingConfig(position_noise=0.5)),
@@ -89,7 +90,7 @@ def test_quarters_average_to_the_error(rollouts):
         torch.testing.assert_close(metrics.error_by_quarter.mean(-1).double(), metrics["error"], rtol=1e-4, atol=1e-6)
 
 
-def test_a_diverging_flock_is_flown_to_the_end_and_counted():
+def test_a_diverging_flock_is_rolled_out_to_the_end_and_counted():
     away = TensorDictModule(
         lambda observation: 10 * observation[..., :3], [("agents", "observation")], [("agents", "action")]
     )
@@ -116,7 +117,21 @@ def test_table_gives_mean_median_spread_and_paired_difference(rollouts):
     assert "error_minus_local" not in table["local expert (1 hop)"]
 
 
-def test_markdown_holds_every_row(rollouts):
+def test_a_new_metric_appears_in_rollouts_and_tables(monkeypatch):
+    monkeypatch.setattr(METRICS, "_added", dict(METRICS._added))
+    METRICS.register(
+        "height", title="height", unit="m", better="higher", about="mean height", over_time="mean", cell="{mean:.1f}"
+    )(lambda position: position[..., 2])
+    rollouts = evaluate({}, FlockingConfig(), num_agents=3, num_flocks=2, steps=4, seed=0)
+    assert rollouts["expert"]["height"].shape == (2,)
+    table = _tables(rollouts, 3)
+    assert table["3"]["rows"]["expert"]["height"]["mean"] == float(rollouts["expert"]["height"].mean())
+    text = evaluation_markdown(table, "title")
+    assert "| height |" in text
+    assert "Height [m]: mean height." in text
+
+
+def test_markdown_contains_every_policy(rollouts):
     text = evaluation_markdown(_tables(rollouts, 6), "title")
     assert all(text.count(f"| {name} ") == 2 for name in rollouts)
     assert "## 6 agents, 4 episodes of 40 steps" in text

@@ -37,10 +37,10 @@ def stored(trainer):
     return YAML[key]
 
 
-def make_run(root, name="dagger-gcn", *, state="finished", trainer=None, metrics=None, **figures):
+def make_run(root, name="dagger-gcn", *, state="finished", trainer=None, metrics=None, **status):
     """A run folder as a trainer leaves it, with a metric of two sizes."""
     run = RunFolder.create(root, name, stored(trainer or DAggerConfig(rounds=10)))
-    run.note_status(state, **{"done": 30, "total": 40, "unit": "updates", "seconds": 10.0, **figures})
+    run.note_status(state, **{"done": 30, "total": 40, "unit": "updates", "seconds": 10.0, **status})
     for step, error in enumerate(ERRORS):
         run.log(step, metrics or {"error": error, "8/validation_loss": error, "16/validation_loss": 3 * error})
     return run
@@ -54,12 +54,12 @@ def write_evaluation(run, rows, sizes=(8,), changes=""):
         fractions = {name for name, entry in METRICS.items() if entry.options["unit"] == "%"}
         return {name: {"mean": 0.25, "n": 5} if name in fractions else spread for name in METRICS}
 
-    flown = {"num_flocks": 5, "steps": 40, "seed": 0}
-    tables = {str(size): {**flown, "rows": {name: row(error) for name, error in rows.items()}} for size in sizes}
+    settings = {"num_flocks": 5, "steps": 40, "seed": 0}
+    tables = {str(size): {**settings, "rows": {name: row(error) for name, error in rows.items()}} for size in sizes}
     run.write(f"evaluation{changes}.json", json.dumps(tables))
 
 
-def test_figures_are_those_of_the_metrics(tmp_path):
+def test_summaries_show_the_logged_metrics(tmp_path):
     run = make_run(tmp_path)
     run.log(len(ERRORS), {"error": math.nan, "8/validation_loss": 7.0, "16/validation_loss": math.nan})
     found = summarise_run(run.path)
@@ -71,7 +71,7 @@ def test_figures_are_those_of_the_metrics(tmp_path):
 
 
 @pytest.mark.parametrize(("trainer", "best"), [(DAggerConfig(), -0.3), (MAPPOConfig(), 0.3), (BCConfig(), -0.3)])
-def test_a_score_is_shown_as_the_metric_it_came_from(tmp_path, trainer, best):
+def test_a_score_is_shown_as_the_metric_it_comes_from(tmp_path, trainer, best):
     run = make_run(tmp_path, trainer=trainer)
     (run.best / "step_000000005").mkdir(parents=True)
     (run.best / "step_000000005" / "state.json").write_text('{"score": -0.3}')
@@ -110,7 +110,7 @@ def test_a_run_that_trains_is_as_far_as_its_metrics(tmp_path):
     assert found.seconds == pytest.approx(60, abs=2)
 
 
-def test_the_reason_is_that_of_the_last_end(tmp_path):
+def test_the_reason_is_that_of_the_last_time_it_ended(tmp_path):
     run = make_run(tmp_path, state="stopped", reason="stopped by SIGTERM")
     assert "stopped by SIGTERM" in show_runs(RunsConfig(runs=str(tmp_path)))
     run.note_status("finished")
@@ -129,7 +129,7 @@ def test_the_last_line_says_what_to_do_next(tmp_path):
     assert last_line() == f"Next: python -m modgnn_rl.train resume={stopped}"
 
 
-def test_looking_changes_nothing(tmp_path):
+def test_listing_and_comparing_change_no_file(tmp_path):
     with make_run(tmp_path, state="training").lock():
         write_evaluation(make_run(tmp_path, "bc-gcn"), {"moment_force": 0.5})
 
@@ -142,7 +142,7 @@ def test_looking_changes_nothing(tmp_path):
         assert content() == before
 
 
-def test_several_policies_stand_under_their_run(tmp_path):
+def test_several_policies_are_listed_under_their_run(tmp_path):
     names = ("gcn-K1", "gcn-K2")
     metrics = {"validation_loss": 0.4} | {
         f"{n}/{s}/validation_loss": i + s for i, n in enumerate(names) for s in (1, 3)
@@ -178,7 +178,7 @@ def test_several_policies_stand_under_their_run(tmp_path):
         ("metrics.jsonl", "[]\n3\n{", ""),
     ],
 )
-def test_what_cannot_be_read_is_said(tmp_path, file, text, said):
+def test_unreadable_files_are_named(tmp_path, file, text, said):
     run, other = make_run(tmp_path), make_run(tmp_path, "other")
     write_evaluation(run, {"moment_force": 0.5})
     (run.path / file).unlink() if text is None else (run.path / file).write_text(text)
@@ -217,7 +217,7 @@ def test_a_list_fits_the_terminal(tmp_path):
         assert len(table.splitlines()) == 4
 
 
-def test_where_there_is_room_all_is_shown(tmp_path):
+def test_all_columns_are_shown_if_there_is_room(tmp_path):
     run = make_run(tmp_path, done=30)
     write_evaluation(run, {"moment_force": 0.5}, sizes=(8, 32))
     row = list_runs([summarise_run(run.path)], 160).splitlines()[1]
@@ -225,7 +225,7 @@ def test_where_there_is_room_all_is_shown(tmp_path):
     assert row.split()[-9:] == ["10", "s", "error", "0.1", "-", "0.5", "0.5", "3", "updates/s"]
 
 
-def test_the_evaluation_listed_is_that_of_the_size_and_world_trained_on(tmp_path):
+def test_the_listed_evaluation_is_that_of_the_size_and_environment_of_training(tmp_path):
     run = make_run(tmp_path)  # 32 agents
 
     def shown():
@@ -275,7 +275,7 @@ def test_runs_in_groups_are_found_and_folders_inside_runs_are_not(tmp_path):
     assert show_runs(RunsConfig(runs=str(tmp_path))).splitlines()[1].startswith(f"sweep/{inside.path.name}")
 
 
-def test_settings_differ_where_they_differ_among_runs_that_have_them(tmp_path):
+def test_settings_are_compared_among_the_runs_that_have_them(tmp_path):
     trainers = [DAggerConfig(rounds=3), DAggerConfig(rounds=4), MAPPOConfig()]
     runs = [summarise_run(make_run(tmp_path, "run", trainer=trainer).path) for trainer in trainers]
     found = differing_settings(runs)
@@ -299,7 +299,7 @@ def test_a_comparison_is_markdown_with_a_column_for_each_run(tmp_path):
     assert "Settings that differ" not in text  # they do not
 
 
-def test_a_run_is_known_by_what_only_it_has_in_its_name(tmp_path):
+def test_a_run_is_found_by_a_unique_part_of_its_name(tmp_path):
     runs = [make_run(tmp_path, name) for name in ("dagger-gcn", "dagger-gcn_final", "bc-gcn")]
     assert find_run("bc", tmp_path).path == runs[2].path
     assert find_run(runs[0].path.name, tmp_path).path == runs[0].path  # a whole name, though part of another
@@ -315,7 +315,7 @@ def test_a_run_is_known_by_what_only_it_has_in_its_name(tmp_path):
         find_run("bc", tmp_path)
 
 
-def test_what_would_move_the_cursor_is_not_printed(tmp_path):
+def test_control_characters_are_not_printed(tmp_path):
     make_run(tmp_path, state="failed", reason="bad \x1b[2J news")
     assert "\x1b" not in show_runs(RunsConfig(runs=str(tmp_path)))
 
@@ -340,21 +340,23 @@ def test_the_command_needs_no_torch_and_heeds_a_closed_pipe(tmp_path):
     assert (process.communicate(timeout=60)[1], process.returncode) == ("", 141)
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match="there is no folder"):
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
         show_runs(RunsConfig(runs=str(tmp_path / "missing")))
     assert show_runs(RunsConfig(runs=str(tmp_path))).endswith("python -m modgnn_rl.train starts one")
 
 
 @pytest.mark.slow
-def test_names_are_those_that_training_gives(tmp_path):
+def test_names_of_metrics_are_those_that_training_logs(tmp_path):
     from modgnn_rl.configs.schema import EvaluationConfig, FlockingConfig
     from modgnn_rl.experiment.training import train
 
     small = {"num_envs": 1, "cloning_steps": 10, "cloning_updates": 20, "batch_size": 16, "num_val_envs": 1}
     trainer = BCConfig(models=["moment_force", "gcn"], **small)
-    flown = EvaluationConfig(num_flocks=2, steps=8)
-    run = train(TrainConfig(FlockingConfig(num_agents=[4, 5]), trainer=trainer, evaluation=flown, runs=str(tmp_path)))
+    settings = EvaluationConfig(num_flocks=2, steps=8)
+    run = train(
+        TrainConfig(FlockingConfig(num_agents=[4, 5]), trainer=trainer, evaluation=settings, runs=str(tmp_path))
+    )
     found, last = summarise_run(run.path), run.read_metrics()[-1]
     assert (found.state, found.share) == ("finished", 1.0)
     assert found.last["validation_loss"] == last["validation_loss"]

@@ -164,7 +164,7 @@ def test_two_agents() -> None:
 
 
 @pytest.mark.parametrize("bad", [NAN, INF, -INF])
-def test_not_finite_flocks_are_diverged(bad: float) -> None:
+def test_flocks_with_nan_or_infinite_coordinates_have_diverged(bad: float) -> None:
     position = torch.zeros(2, 4, 3)
     position[1, 2, 1] = bad
     assert metrics.is_diverged(position, 10.0).tolist() == [False, True]

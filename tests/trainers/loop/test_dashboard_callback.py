@@ -30,7 +30,7 @@ class Recorder(Dashboard):
     shows_videos = True
 
     def __init__(self):
-        self.histograms, self.films, self.tables, self.references = [], [], {}, []
+        self.histograms, self.videos, self.tables, self.references = [], [], {}, []
 
     def log(self, step, metrics):
         """Leave it: this is about the rest."""
@@ -45,7 +45,7 @@ class Recorder(Dashboard):
 
     def log_video(self, step, name, path):
         """Keep it."""
-        self.films.append((step, name, path))
+        self.videos.append((step, name, path))
 
     def log_table(self, name, columns, rows):
         """Keep it."""
@@ -80,7 +80,7 @@ def test_training_is_the_same_to_the_last_bit(tmp_path, name, monkeypatch, small
     plain = train(small_config(tmp_path, name), evaluate=False)
     monkeypatch.setattr(training, "make_logger", lambda *_: LoggerGroup({"recorder": lambda: recorder}))
     watched = train(small_config(tmp_path, name, video_rounds=1), evaluate=False)
-    assert len(recorder.films) == len(watched.read_metrics()) - (name == "dagger")  # which begins with round 0
+    assert len(recorder.videos) == len(watched.read_metrics()) - (name == "dagger")  # which begins with round 0
     assert recorder.tables
     assert recorder.references
     assert recorder.histograms
@@ -104,7 +104,7 @@ def test_the_evaluation_is_logged_as_a_table_of_all_metrics():
     assert [cells[name] for name in list(METRICS)[1:]] == list(means.values())[1:]
 
 
-def test_reference_lines_are_those_of_the_reference_flights(watch):
+def test_reference_lines_are_those_of_the_reference_rollouts(watch):
     watch, recorder = watch
     env_config = watch.config.env
     for size in (4, 5):
@@ -127,7 +127,7 @@ def test_reference_lines_are_those_of_the_reference_flights(watch):
     assert lines["pair_force-K1/5/cohesion"]["expert"] == float(rollouts["cohesion"].mean())
 
 
-def test_lines_are_drawn_on_each_tenth_round_for_new_metrics_and_at_the_end(watch):
+def test_reference_lines_are_extended_every_ten_rounds_for_new_metrics_and_at_the_end(watch):
     watch, recorder = watch
     watch.config.video_rounds = 0
     for index in range(1, 24):
@@ -136,7 +136,7 @@ def test_lines_are_drawn_on_each_tenth_round_for_new_metrics_and_at_the_end(watc
     assert [step for step, _ in recorder.references] == [1, 10, 13, 20, 23]
 
 
-def test_actions_shown_are_those_of_the_agents_that_are_flown(watch):
+def test_logged_actions_are_those_of_controlled_agents(watch):
     watch, recorder = watch
     action = torch.arange(2 * 3 * 4 * 3.0).view(2, 3, 4, 3)
     controlled = torch.ones(2, 3, 4, dtype=torch.bool)
@@ -147,7 +147,7 @@ def test_actions_shown_are_those_of_the_agents_that_are_flown(watch):
     assert values.tolist() == action[:, :, 1:].flatten().tolist()
 
 
-def test_films_each_so_many_rounds_and_at_the_end(watch):
+def test_videos_are_made_every_n_rounds_and_at_the_end(watch):
     pytest.importorskip("av")
     pytest.importorskip("matplotlib")
     watch, recorder = watch
@@ -158,15 +158,15 @@ def test_films_each_so_many_rounds_and_at_the_end(watch):
     watch.on_end({})
     assert torch.equal(before, torch.get_rng_state())
     folder = watch.run.path / "videos"
-    films = [(index, "4/rollout", folder / f"round_{index:05d}.mp4") for index in (2, 3)]
-    assert recorder.films == films
-    assert sorted(folder.iterdir()) == [path for *_, path in films]
+    videos = [(index, "4/rollout", folder / f"round_{index:05d}.mp4") for index in (2, 3)]
+    assert recorder.videos == videos
+    assert sorted(folder.iterdir()) == [path for *_, path in videos]
 
 
-def test_nothing_that_it_calls_draws_from_the_training(watch):
+def test_the_random_numbers_of_training_are_not_touched(watch):
     watch, _ = watch
     before = torch.get_rng_state()
-    watch._attempt("a draw", lambda: torch.rand(1))
+    watch._attempt("a sample", lambda: torch.rand(1))
     assert torch.equal(before, torch.get_rng_state())
 
 
@@ -190,7 +190,7 @@ def test_what_fails_is_left_out_with_one_warning(watch, monkeypatch):
     assert recorder.references
 
 
-def test_missing_packages_are_said_once(tmp_path, monkeypatch, small_config):
+def test_missing_packages_are_reported_once(tmp_path, monkeypatch, small_config):
     monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
     watch = DashboardCallback(small_config(tmp_path, "dagger"), None, LoggerGroup({"recorder": Recorder}))
 
