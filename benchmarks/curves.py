@@ -1,7 +1,7 @@
-"""Draw metrics of runs over their rounds: ``python benchmarks/curves.py curves.png 32/error runs/a runs/b ...``.
+"""Plot metrics of runs over their rounds: ``python benchmarks/curves.py curves.png 32/error runs/a runs/b ...``.
 
-Runs with one label, ``runs/a=label``, or whose names differ in ``-seed<n>`` or a trailing number only, share a line
-(their mean) and a band (lowest to highest). Needs the extra ``plots``.
+Runs with the same label, ``runs/a=label``, or whose names differ only in ``-seed<n>`` or a trailing number, share a
+line (their mean) and a band (minimum to maximum). Needs the extra ``plots``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from modgnn_rl.tracking.run_folder import RunFolder
 
 
 def smooth(values: np.ndarray, width: int) -> np.ndarray:
-    """Running mean over so many rounds, shorter at the ends; NaN does not count."""
+    """Running mean over ``width`` rounds, fewer at the ends; NaN does not count."""
     known = np.isfinite(values)
     kernel = np.ones(width)
     total = np.convolve(np.where(known, values, 0.0), kernel, "same")
@@ -27,18 +27,18 @@ def smooth(values: np.ndarray, width: int) -> np.ndarray:
 
 
 def group_of(run: RunFolder) -> str:
-    """The name of a run without date and seed."""
+    """The name of a run without its date and seed."""
     name = re.sub(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-", "", run.path.name)
     return re.sub(r"(-seed)?\d+$", "", name) or name
 
 
 def main() -> None:
-    """Read the runs, draw one panel a metric."""
+    """Read the runs and plot one panel per metric."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("picture", help="file to write: PNG, SVG or PDF")
     parser.add_argument("metrics", help="names in metrics.jsonl, separated by commas")
     parser.add_argument("runs", nargs="+", help="run folders")
-    parser.add_argument("--width", type=int, default=9, help="rounds that are averaged")
+    parser.add_argument("--width", type=int, default=9, help="rounds to average over")
     parser.add_argument("--log", action="store_true", help="logarithmic scale")
     parser.add_argument("--line", action="append", default=[], help="metric=value=label: a horizontal line")
     options = parser.parse_args()

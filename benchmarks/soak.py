@@ -1,9 +1,9 @@
-"""Hours of training with random faults: ``python benchmarks/soak.py --hours 2``.
+"""Hours of training with random failures: ``python benchmarks/soak.py --hours 2``.
 
-A training run is killed, interrupted, halted, denied the disk, robbed of its dashboard's helper, and has its newest
-checkpoint damaged, at random moments; where it ended it is resumed. At the end this says how often each happened, and
-whether memory grew, a line of metrics was missing or doubled, or a file or process was left behind; exit code 1 if so.
-Linux only: it reads ``/proc``.
+At random moments a training run is killed, interrupted or halted, its disk is full, the helper process of its dashboard
+is killed, or its newest checkpoint is damaged; whenever it ends it is resumed. In the end this prints how often each
+failure happened, and whether memory grew, a line of metrics was missing or duplicated, or a file or process was left
+behind; the exit code is 1 in that case. Linux only: it reads ``/proc``.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ PAGE = resource.getpagesize()
 
 
 class Soak:
-    """One training run, resumed as often as it ends.
+    """One training run, resumed whenever it ends.
 
     Args:
-        folder: where the run and its temporary files go; nothing else may lie there.
-        moments: source of the faults and of their moments.
+        folder: for the run and its temporary files, otherwise empty.
+        moments: source of the failures and of their times.
     """
 
     def __init__(self, folder: Path, moments: random.Random) -> None:
         self.folder, self.moments = folder, moments
         self.temporary = folder / "tmp"
         self.temporary.mkdir()
-        self.faults: Counter[str] = Counter()
+        self.failures: Counter[str] = Counter()
         self.complaints: list[str] = []
         self.lives: list[list[tuple[float, float]]] = []  # of each process: seconds alive, megabytes resident
         self.process = self._start()
@@ -66,19 +66,19 @@ class Soak:
         return run
 
     def live(self, seconds: float) -> None:
-        """Let the run train, and watch its memory."""
+        """Let the run train, and record its memory."""
         until = time.monotonic() + seconds
         while time.monotonic() < until and self.process.poll() is None:
             pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
             self.lives[-1].append((time.monotonic() - self.began, pages * PAGE / 2**20))
             time.sleep(min(5.0, max(until - time.monotonic(), 0.01)))
 
-    def strike(self) -> None:
-        """Let one fault happen; where it ended the run, resume it."""
+    def fail(self) -> None:
+        """Cause one failure; if it ended the run, resume it."""
         ending = [self.kill, self.kill_while_writing, self.stop, self.interrupt, self.damage]
-        fault: Callable[[], None] = self.moments.choice([*ending, self.halt, self.fill_disk, self.kill_dashboard])
-        self.faults[fault.__name__] += 1
-        fault()
+        failure: Callable[[], None] = self.moments.choice([*ending, self.halt, self.fill_disk, self.kill_dashboard])
+        self.failures[failure.__name__] += 1
+        failure()
         if self.process.poll() is not None:
             self._check_left_behind()
             self.process = self._start("resume=" + str(self.run))
@@ -103,7 +103,7 @@ class Soak:
         self._end(signal.SIGINT, 130)
 
     def damage(self) -> None:
-        """End it with SIGKILL, and flip one bit of the newest checkpoint."""
+        """End it with SIGKILL, and flip one bit in the newest checkpoint."""
         self.kill()
         newest = max((self.run / "checkpoints").glob("step_*[0-9]"), key=lambda path: path.stat().st_mtime)
         file = self.moments.choice(sorted(newest.iterdir()))
@@ -112,13 +112,13 @@ class Soak:
         file.write_bytes(content)
 
     def halt(self) -> None:
-        """The process stands still for a while, as on a machine that sleeps."""
+        """Stop the process for a while, as on a machine that sleeps."""
         self.process.send_signal(signal.SIGSTOP)
         time.sleep(20)
         self.process.send_signal(signal.SIGCONT)
 
     def fill_disk(self) -> None:
-        """No file may grow beyond 20 kB for half a minute."""
+        """Limit files to 20 kB for half a minute."""
         unlimited = resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
         self.live(30)
         if self.process.poll() is None:
@@ -127,12 +127,12 @@ class Soak:
             self.complaints.append(f"a full disk ended the run with code {self.process.returncode}")
 
     def kill_dashboard(self) -> None:
-        """The dashboard's helper process dies."""
+        """Kill the helper process of the dashboard."""
         for pid in self._others():
             os.kill(pid, signal.SIGKILL)
 
     def finish(self) -> None:
-        """Stop the run and look at what it left."""
+        """Stop the run and check what it left."""
         self.stop()
         self._check_left_behind()
         if left := list(self.run.rglob("*.tmp*")):
@@ -146,7 +146,7 @@ class Soak:
         print(f"checkpoints: {', '.join(kept)}")
 
     def memory(self) -> str:
-        """How memory went in the longest life, from the moment when the data are full."""
+        """Growth of memory in the longest life, from when the replay buffer is full."""
         longest = max(self.lives, key=len)
         seconds, megabytes = np.array(longest[len(longest) // 3 :]).T
         slope = np.polyfit(seconds / 3600, megabytes, 1)[0]
@@ -182,7 +182,7 @@ class Soak:
             self.complaints.append(f"signal {kind} ended the run with code {ended}, not {code}")
 
     def _others(self) -> list[int]:
-        """The processes that the run began: those of its session."""
+        """The processes that the run started: those of its session."""
         found = subprocess.run(["ps", "-s", str(self.process.pid), "-o", "pid="], capture_output=True, text=True)
         return [pid for pid in map(int, found.stdout.split()) if pid != self.process.pid]
 
@@ -194,18 +194,18 @@ class Soak:
             self.complaints.append(f"process {pid} outlived its run by half a minute")
             os.kill(pid, signal.SIGKILL)
         left = [path for path in self.temporary.rglob("*") if path.is_file()]
-        if left and self.process.returncode > 0:  # who is killed cannot tidy up
+        if left and self.process.returncode > 0:  # a killed process cannot tidy up
             self.complaints.append(f"{len(left)} temporary files left, such as {left[0]}")
-        shutil.rmtree(self.temporary, ignore_errors=True)  # a socket may go just now
+        shutil.rmtree(self.temporary, ignore_errors=True)  # a socket may disappear just now
         self.temporary.mkdir(exist_ok=True)
 
 
 def main() -> None:
-    """Soak, and say what was found."""
+    """Soak, and print what was found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hours", type=float, default=2.0)
-    parser.add_argument("--seed", type=int, default=0, help="of the faults")
-    parser.add_argument("--pause", type=float, default=150.0, help="mean time between two faults, s")
+    parser.add_argument("--seed", type=int, default=0, help="of the failures")
+    parser.add_argument("--pause", type=float, default=150.0, help="mean time between two failures (s)")
     options = parser.parse_args()
     moments = random.Random(options.seed)
     folder = Path(tempfile.mkdtemp(prefix="soak-"))
@@ -215,8 +215,8 @@ def main() -> None:
         soak.live(60)  # a first checkpoint
         while time.monotonic() < until:
             soak.live(moments.expovariate(1 / options.pause))
-            soak.strike()
-            print(f"{(until - time.monotonic()) / 60:.0f} min left, faults: {dict(soak.faults)}", flush=True)
+            soak.fail()
+            print(f"{(until - time.monotonic()) / 60:.0f} min left, failures: {dict(soak.faults)}", flush=True)
         soak.live(60)
         soak.finish()
     finally:

@@ -1,8 +1,8 @@
-"""Where the time of a training run goes: ``python benchmarks/training_profile.py`` profiles the default run.
+"""Profile of a training run: ``python benchmarks/training_profile.py`` profiles the default run.
 
-Takes the settings of ``python -m modgnn_rl.train``, as in ``trainer.rounds=20 logger=tensorboard``. A line is the time
-without that of other lines, on the clock and on the processor; where they differ, this process waited for others or the
-disk.
+Takes the settings of ``python -m modgnn_rl.train``, as in ``trainer.rounds=20 logger=tensorboard``. Each line of the
+table is the wall-clock and the processor time of one part without that of other lines; where they differ, the process
+waited for others or the disk.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ WHOLE = ("forward", "logging", "logging: reference rollouts, once")
 
 
 class Clock:
-    """Adds up how long each part takes, without the parts inside it."""
+    """Sums up the time of each part, without the parts inside it."""
 
     def __init__(self) -> None:
-        self.seconds: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(2))  # on the clock, on the processor
+        self.seconds: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(2))  # wall clock, processor
         self._parts: list[str] = ["the rest"]
         self._since = _now()
 
     def watch(self, owner: Any, name: str, part: str) -> None:
-        """Count the calls of a function as a part; inside one of `WHOLE` they count as that."""
+        """Count the calls of a function as a part, or as part of one of `WHOLE` inside it."""
         function = getattr(owner, name)
 
         def timed(*arguments: Any, **options: Any) -> Any:
@@ -55,7 +55,7 @@ def _now() -> np.ndarray:
 
 
 def watched() -> Clock:
-    """A clock on all that a run does."""
+    """A clock that watches all parts of a run."""
     import torch
     from torch.optim.swa_utils import AveragedModel
     from torchrl.data import ReplayBuffer
@@ -94,13 +94,13 @@ def watched() -> Clock:
 
 
 def main(config: TrainConfig) -> None:
-    """Train, and print where the time went; there is no evaluation at the end."""
+    """Train without evaluation, and print a table of the time that each part took."""
     from modgnn_rl.experiment.training import train
 
     clock = watched()
     train(config, evaluate=False)
     total = np.sum(list(clock.seconds.values()), axis=0)
-    print("\n| part | clock, s | share | processor, s | share |\n|---|---:|---:|---:|---:|")
+    print("\n| part | wall clock (s) | fraction | processor (s) | fraction |\n|---|---:|---:|---:|---:|")
     for part, seconds in sorted([*clock.seconds.items(), ("all", total)], key=lambda entry: -entry[1][1]):
         (wall, busy), (wall_share, share) = seconds, seconds / total
         print(f"| {part} | {wall:.1f} | {wall_share:.1%} | {busy:.1f} | {share:.1%} |")

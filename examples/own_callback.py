@@ -1,10 +1,10 @@
-"""Train from Python, with an expert and callbacks of one's own.
+"""Train from Python, with a custom expert and custom callbacks.
 
     python examples/own_callback.py
 
-The expert below keeps more distance than the usual one. `modgnn_rl.experiment.training.train` does all that
-``python -m modgnn_rl.train`` does, and leaves the same folder; its callbacks are called while it works: one prints,
-one stops the training as soon as the policy is good enough.
+The expert below keeps more distance than the default one. `modgnn_rl.experiment.training.train` does the same as
+``python -m modgnn_rl.train`` and leaves the same folder. Callbacks are called during training: one prints metrics, the
+other stops training as soon as the policy is good enough.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from modgnn_rl.trainers.loop.callbacks import Callback
 
 
 def spacious(observation: Tensor) -> Tensor:
-    """Target velocities, m/s [*B, N, 3], by Reynolds' rule with three times the usual separation."""
+    """Target velocities (m/s) [*B, N, 3] by Reynolds' rule with three times the default separation."""
     position, velocity = observation.split(3, -1)
     return reynolds(position, velocity, cohesion=0.06, separation=2.4, alignment=0.02, max_speed=0.92)
 
 
 class Print(Callback):
-    """Prints how far the flocks keep apart while they learn."""
+    """Prints error and separation after each round."""
 
     def on_round(self, index: int, metrics: Mapping[str, float]) -> None:
-        """Print two of the metrics, which are those of ``metrics.jsonl``."""
+        """Print two of the metrics, as they are in ``metrics.jsonl``."""
         if "8/error" in metrics:
             print(f"round {index}: error {metrics['8/error']:.4f} m²/s², nearest {metrics['8/separation']:.2f} m")
 
 
 class StopWhenGood(Callback):
-    """Stops as soon as the policy, flying alone, errs less than this, m²/s²."""
+    """Stops as soon as the policy, acting alone, has an error below this (m²/s²)."""
 
     def __init__(self, error: float) -> None:
         self.error = error
@@ -54,13 +54,13 @@ def main(error: float = 0.02, runs: Path = Path("runs"), steps: int = 480, **tra
     """Train.
 
     Args:
-        error: m²/s², at which to stop.
+        error: at which to stop (m²/s²).
         runs: folder for the run folder.
-        steps: of the rollouts of the evaluation.
+        steps: of the evaluation rollouts.
         trainer: settings of `DAggerConfig`.
 
     Returns:
-        the figures of ``evaluation.json``.
+        the content of ``evaluation.json``.
     """
     config = TrainConfig(
         env=FlockingConfig(num_agents=8, comm_range=6.0),
@@ -77,6 +77,6 @@ def main(error: float = 0.02, runs: Path = Path("runs"), steps: int = 480, **tra
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--error", type=float, default=0.02, help="where to stop, m²/s²")
+    parser.add_argument("--error", type=float, default=0.02, help="error at which to stop (m²/s²)")
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder for the run folder")
     main(**vars(parser.parse_args()))

@@ -1,11 +1,11 @@
-"""Write MAPPO as a loop of one's own, with a reward of one's own.
+"""MAPPO as a custom loop, with a custom reward.
 
     python examples/own_mappo.py
 
-The reward below asks for something that no expert shows: keep 1 m from the nearest agent. It is written by a transform
-of the environment, in place of the environment's own, from the terms of that and a new one. Actor, critic and loss are
-those of ``python -m modgnn_rl.train trainer=mappo``, and any of them may be another. In 30 rounds from scratch, the
-mean reward of a step rises from -0.72 to about -0.35.
+The reward below asks for something that no expert demonstrates: keep 1 m from the nearest agent. A transform of the
+environment writes it in place of the environment's reward, with the same terms and a new one. Actor, critic and loss
+are those of ``python -m modgnn_rl.train trainer=mappo``, and any of them can be replaced. In 30 rounds from scratch,
+the mean reward per step rises from -0.72 to about -0.35.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ def main(
     batches: int = 4,
     seed: int = 0,
 ) -> list[float]:
-    """Train a policy; returns the mean reward of a step in each round, before it learns from them."""
+    """Train a policy; returns the mean reward per step in each round, before its updates."""
     torch.manual_seed(seed)
     actor, critic = GaussianActor(make_model("pair_force"), noise=0.3), FlockCritic()
-    # An action lasts 1/12 s here, so that what it does is felt within few steps.
+    # An action lasts 1/12 s here, so that it has an effect within a few steps.
     env_config = FlockingConfig(max_steps=steps, control_frequency=12.0, physics_substeps=20)
     env = TransformedEnv(FlockingEnv(num_envs, num_agents, config=env_config, seed=seed), OwnReward())
     collector = Collector(
@@ -79,7 +79,7 @@ def main(
         sample_log_prob=("agents", "action_log_prob"),
     )
     loss_module.make_value_estimator(gamma=0.97, lmbda=0.95)
-    # One item is one flock's window of steps: TorchRL's losses run recurrent policies over windows.
+    # One item is the rollout of one flock: TorchRL's losses run recurrent policies over windows.
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(num_envs), sampler=SamplerWithoutReplacement(), batch_size=num_envs // batches
     )
@@ -87,9 +87,9 @@ def main(
 
     rewards: list[float] = []
     for rollouts in collector:
-        flown = rollouts["agents", "controlled"]
-        rollouts["collector", "mask"] = flown.unsqueeze(-1)  # the leader flies as it likes
-        rewards.append(rollouts["next", "agents", "reward"][flown].mean().item())
+        controlled = rollouts["agents", "controlled"]
+        rollouts["collector", "mask"] = controlled.unsqueeze(-1)  # the leader is not trained
+        rewards.append(rollouts["next", "agents", "reward"][controlled].mean().item())
         print(f"round {len(rewards)}: reward {rewards[-1]:.3f}, noise {actor.noise:.2f} m/s")
         with torch.no_grad():
             loss_module.value_estimator(rollouts)
@@ -106,11 +106,11 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--num-envs", type=int, default=32, help="flocks flown at once")
+    parser.add_argument("--num-envs", type=int, default=32, help="flocks in parallel")
     parser.add_argument("--num-agents", type=int, default=8, help="agents in each, the leader included")
-    parser.add_argument("--steps", type=int, default=60, help="steps flown in each round, from the start")
+    parser.add_argument("--steps", type=int, default=60, help="steps per round, from the start")
     parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--epochs", type=int, default=4, help="passes over the rollouts of one round")
-    parser.add_argument("--batches", type=int, default=4, help="parts of such a pass")
+    parser.add_argument("--batches", type=int, default=4, help="minibatches per pass")
     parser.add_argument("--seed", type=int, default=0)
     main(**vars(parser.parse_args()))

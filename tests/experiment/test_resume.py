@@ -1,4 +1,4 @@
-"""A run that was stopped, or killed, and goes on ends as if nothing had happened."""
+"""A run that was stopped or killed, and is resumed, ends like an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ QUICK = {"dagger with a reservoir, stored messages, a plateau", "mappo"}
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in RUNS]
 )
-def test_a_stopped_run_ends_as_one_that_was_not(tmp_path, name, config, stopped_run):
+def test_a_stopped_and_resumed_run_ends_like_an_uninterrupted_one(tmp_path, name, config, stopped_run):
     straight = train(config(tmp_path / "straight", *RUNS[name]), evaluate=False)
     run = stopped_run(tmp_path / "stopped", *RUNS[name], at=1 if name.startswith("bc") else 2)
     assert run.state == "stopped"
@@ -153,7 +153,7 @@ def test_a_stopped_run_ends_as_one_that_was_not(tmp_path, name, config, stopped_
 
 
 @pytest.mark.parametrize("how", ["another number of agents", "no data in checkpoints"])
-def test_flocks_or_data_that_begin_anew(tmp_path, capsys, how, stopped_run):
+def test_environments_or_data_that_start_afresh(tmp_path, capsys, how, stopped_run):
     kept = how == "another number of agents"
     run = stopped_run(tmp_path, "dagger", {**DAGGER, "checkpoint_data": kept})
     before = load_policy(run.path).state_dict()
@@ -163,7 +163,7 @@ def test_flocks_or_data_that_begin_anew(tmp_path, capsys, how, stopped_run):
     assert any(not torch.equal(value, before[name]) for name, value in load_policy(run.path).state_dict().items())
 
 
-def test_what_cannot_change_is_named_and_nothing_is_touched(tmp_path, stopped_run):
+def test_a_setting_that_cannot_change_is_named_and_nothing_is_touched(tmp_path, stopped_run):
     run = stopped_run(tmp_path, "dagger", DAGGER)
     before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match=r"cannot change model\.hidden from 32 to 64"):
@@ -185,7 +185,7 @@ def test_the_best_policy_is_kept_beside_the_last(tmp_path, config):
         load_policy(run.path, which="best")
 
 
-def test_a_run_that_fails_leaves_the_policies_of_before(tmp_path, config):
+def test_a_run_that_fails_keeps_the_earlier_policies(tmp_path, config):
     run = train(config(tmp_path, *RUNS["bc of several policies with DART"]), evaluate=False)
     before = {path: path.read_bytes() for path in run.path.glob("*/checkpoints/*/*")}
     assert len(before) >= 4 * 3  # of four policies
@@ -206,7 +206,9 @@ def test_a_run_that_fails_leaves_the_policies_of_before(tmp_path, config):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["process", "ray"])
 @pytest.mark.parametrize("name", ["dagger of two sizes with perturbations", "dagger with an ensemble", "mappo"])
-def test_a_stopped_run_of_workers_ends_as_one_that_was_not(tmp_path, name, kind, config, stopped_run):
+def test_a_stopped_and_resumed_run_with_workers_ends_like_an_uninterrupted_one(
+    tmp_path, name, kind, config, stopped_run
+):
     if kind == "ray":
         pytest.importorskip("ray")
     trainer, settings = RUNS[name]

@@ -92,7 +92,7 @@ def _assert_equal(one, other):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trainer", ["bc", "dagger", "mappo"])
-def test_killed_at_random_moments(tmp_path, trainer, config):
+def test_runs_killed_at_random_moments(tmp_path, trainer, config):
     began = time.monotonic()
     straight = train(config(tmp_path / "straight", trainer), evaluate=False)
     duration = time.monotonic() - began
@@ -120,7 +120,7 @@ def test_killed_at_random_moments(tmp_path, trainer, config):
 
 
 @pytest.mark.slow
-def test_killed_at_every_call_that_touches_a_file_while_a_checkpoint_is_written(tmp_path):
+def test_killed_at_every_file_operation_while_a_checkpoint_is_written(tmp_path):
     tensors = {"policy": {"weight": torch.arange(6.0)}, "data": {"rows": torch.zeros(1000, 10)}}
 
     def save_and_die(folder, alive_for):
@@ -153,7 +153,7 @@ def test_killed_at_every_call_that_touches_a_file_while_a_checkpoint_is_written(
     print(f"killed at {alive_for - 1} calls")
 
 
-def test_a_full_disk_does_not_stop_training_and_is_said(tmp_path, finished, config):
+def test_a_full_disk_does_not_stop_training_and_is_reported(tmp_path, finished, config):
     def train_on_a_small_disk():
         warnings.simplefilter("default")
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # of a file; the checkpoints are larger
@@ -188,7 +188,7 @@ def _damage(path: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", [pytest.param("cut", marks=pytest.mark.slow), "one bit flipped"])
-def test_a_damaged_checkpoint_is_passed_over(tmp_path, finished, how):
+def test_a_damaged_checkpoint_is_skipped(tmp_path, finished, how):
     straight = _contents(finished)
     newest = max(finished.checkpoints.iterdir())
     for file in sorted(newest.iterdir()):
@@ -206,7 +206,7 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path, finished, how):
         resume(folder, evaluate=False)
 
 
-def test_two_runs_in_one_folder(finished):
+def test_a_folder_in_use_is_refused(finished):
     with finished.lock():
         assert finished.is_locked
         process = multiprocessing.get_context("fork").Process(target=_refused, args=(finished.path,))

@@ -67,17 +67,17 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_table(run):
     assert all(row in (run.path / "evaluation.md").read_text() for row in rows)
 
 
-def test_a_checkpoint_holds_what_a_run_is_made_of(run):
+def test_a_checkpoint_holds_the_whole_state_of_a_run(run):
     checkpoint = load_checkpoint(run.checkpoints)
     of_flocks = {
         f"{name}.{part}" for name in ("rollouts-5", "validation-5") for part in ("env", "carried", "mixture", "data")
     }
     assert set(checkpoint.tensors) == {"policy", "trained", "optimizer", "generators", *of_flocks}
-    drawn = ("env", "faults", "noise", "places", "mixture", "disturbance", "batches")
+    generators = ("env", "faults", "noise", "places", "mixture", "disturbance", "batches")
     assert set(checkpoint.tensors["generators"]) == {
         "learner",
         "validation",
-        *(f"{name}.{role}" for name in ("rollouts-5", "validation-5") for role in drawn),
+        *(f"{name}.{role}" for name in ("rollouts-5", "validation-5") for role in generators),
     }
     assert checkpoint.state["config"] == run.config
     assert checkpoint.state["updates"] == checkpoint.state["averaged"] == 10
@@ -85,7 +85,7 @@ def test_a_checkpoint_holds_what_a_run_is_made_of(run):
 
 
 @pytest.mark.parametrize("agents", [1, 2, 9])
-def test_the_policy_loads_and_flies_at_any_size(run, agents):
+def test_the_policy_loads_and_acts_at_any_size(run, agents):
     policy = load_policy(run.path)
     agents_data = TensorDict({"observation": torch.randn(4, agents, 6)}, [4])
     step = TensorDict({"agents": agents_data, "adjacency": torch.zeros(4, agents, agents, dtype=torch.bool)}, [4])
@@ -93,7 +93,7 @@ def test_the_policy_loads_and_flies_at_any_size(run, agents):
     assert policy(step)["agents", "action"].shape == (4, agents, 3)
 
 
-def test_evaluation_repeats_what_training_ended_with(run):
+def test_evaluation_repeats_that_at_the_end_of_training(run):
     before = (run.path / "evaluation.json").read_text()
     settings = EvaluationConfig(num_flocks=3, steps=12)
     evaluate_run(EvaluateConfig(run=str(run.path), evaluation=settings, threads=1))
@@ -107,7 +107,7 @@ def test_evaluation_at_other_sizes(run):
     assert {size: table["num_flocks"] for size, table in tables.items()} == {"3": 2, "5": 3, "7": 2}
 
 
-def test_evaluation_in_another_world_has_files_of_its_own(run):
+def test_evaluation_in_another_environment_has_its_own_files(run):
     before = (run.path / "evaluation.json").read_text()
     changes = EnvOverrides(message_loss=0.5, physics="bullet")
     config = EvaluateConfig(
@@ -122,7 +122,7 @@ def test_evaluation_in_another_world_has_files_of_its_own(run):
         evaluate_run(dataclasses.replace(config, env=EnvOverrides(max_links="many")))
 
 
-def test_one_seed_fixes_a_run(tmp_path, config):
+def test_the_seed_determines_a_run(tmp_path, config):
     metrics = []
     for seed in (1, 1, 2):
         run = train(config(tmp_path, seed=seed, name=f"seed{seed}"))
@@ -139,14 +139,14 @@ def test_behaviour_cloning_of_several_sizes(tmp_path, small_config):
 
 
 @pytest.mark.slow  # about three minutes
-def test_dagger_learns_to_fly_better_than_the_local_expert(tmp_path):
+def test_dagger_beats_the_local_expert(tmp_path):
     run = train(TrainConfig(trainer=DAggerConfig(), runs=str(tmp_path), threads=1))
     table = json.loads((run.path / "evaluation.json").read_text())["32"]["rows"]
     assert table["moment_force"]["error"]["mean"] < 0.09
     assert table["moment_force"]["error_minus_local"]["high"] < 0
 
 
-def test_a_device_that_is_not_there():
+def test_a_missing_device_is_reported():
     with pytest.raises(InputError, match="device=cuda:99 cannot be used"):
         prepare_torch("cuda:99", 1)
 
@@ -179,7 +179,7 @@ def _command(module, *arguments, folder):
         (["trainer.learning_rates=[1e-3]"], "trainer.learning_rates"),
     ],
 )
-def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, arguments, words):
+def test_an_invalid_setting_is_one_line_and_leaves_nothing(tmp_path, arguments, words):
     done = _command("train", *arguments, folder=tmp_path)
     assert done.returncode == 2
     assert words in done.stderr
@@ -197,7 +197,9 @@ def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, arguments, words):
         (["trainer.updates_per_round=1", "env.num_agents=[4,5]"], "too few for 2 flock sizes"),
     ],
 )
-def test_a_mistake_that_training_finds_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capsys, arguments, words):
+def test_an_invalid_setting_that_training_finds_is_one_line_and_leaves_nothing(
+    tmp_path, monkeypatch, capsys, arguments, words
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
     monkeypatch.setattr(sys, "argv", ["train", *arguments])
@@ -220,7 +222,7 @@ def test_a_mistake_that_training_finds_is_one_line_and_leaves_nothing(tmp_path, 
         ("export", "run=nowhere", "is no run folder"),
     ],
 )
-def test_a_folder_that_cannot_be_used_is_said_before_torch_is_imported(tmp_path, command, argument, words):
+def test_an_unusable_folder_is_reported_before_torch_is_imported(tmp_path, command, argument, words):
     (tmp_path / "file").touch()
     program = f"""
 import atexit, runpy, sys
@@ -236,7 +238,7 @@ runpy.run_module("modgnn_rl.{command}", run_name="__main__")
 
 
 @pytest.mark.parametrize("model", ["moment_force", "mpnn"])
-def test_training_goes_on_under_faults_and_learns_from_the_true_state(tmp_path, model, config):
+def test_training_under_perturbations_learns_from_the_true_state(tmp_path, model, config):
     env_config = FlockingConfig(
         num_agents=[4, 6],
         message_loss=0.3,

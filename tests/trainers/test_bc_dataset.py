@@ -1,4 +1,4 @@
-"""Behaviour cloning on a dataset: never on the held-out rollouts, and never on a dataset that does not fit."""
+"""Behaviour cloning on a dataset: validation episodes are kept apart, and a dataset that does not fit is refused."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.imitation.learner import ImitationLearner
 
-WORLD = FlockingConfig(num_agents=5)
+ENV = FlockingConfig(num_agents=5)
 EPISODES, STEPS = 6, 30
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "set"
-    return collect(CollectConfig(env=WORLD, episodes=EPISODES, steps=STEPS, num_envs=4, output=str(path)))
+    return collect(CollectConfig(env=ENV, episodes=EPISODES, steps=STEPS, num_envs=4, output=str(path)))
 
 
 def run_bc(
-    runs: Path, dataset: Path, *, env: FlockingConfig = WORLD, model: str = "pair_force", **settings: Any
+    runs: Path, dataset: Path, *, env: FlockingConfig = ENV, model: str = "pair_force", **settings: Any
 ) -> RunFolder:
     small = {"batch_size": 16, "cloning_steps": 10, "cloning_updates": 20, "num_val_envs": 2, "capacity": 10}
     trainer = BCConfig(dataset=str(dataset), **{**small, **settings})
@@ -44,7 +44,7 @@ def run_bc(
     return train(config, evaluate=False)
 
 
-def test_held_out_flights_are_not_trained_on(tmp_path: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_validation_episodes_are_not_trained_on(tmp_path: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: dict[range, set[int]] = {}
     windows = EpisodeDataset.windows
 
@@ -70,7 +70,7 @@ def test_a_learner_fits_a_dataset(dataset: Path) -> None:
     assert learner.validate(buffer) < 0.5 * before
 
 
-def test_one_seed_fixes_a_run_and_its_generators_are_kept(tmp_path: Path, dataset: Path) -> None:
+def test_the_seed_determines_a_run_and_checkpoints_keep_its_generators(tmp_path: Path, dataset: Path) -> None:
     runs = [run_bc(tmp_path, dataset, model="modgnn_mlp") for _ in range(2)]
     assert runs[0].metrics_file.read_bytes() == runs[1].metrics_file.read_bytes()
     states = [load_checkpoint(run.checkpoints).tensors["generators"]["validation-5.batches"] for run in runs]
@@ -87,7 +87,7 @@ def test_one_seed_fixes_a_run_and_its_generators_are_kept(tmp_path: Path, datase
         ({"dataset": "nowhere"}, "nowhere is no dataset of rollouts"),
     ],
 )
-def test_what_does_not_fit_is_refused_before_a_run_is_made(
+def test_a_dataset_that_does_not_fit_is_refused_before_a_run_is_created(
     tmp_path: Path, dataset: Path, settings: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
@@ -95,7 +95,7 @@ def test_what_does_not_fit_is_refused_before_a_run_is_made(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_dataset_is_refused_before_a_run_is_made(tmp_path: Path, dataset: Path) -> None:
+def test_a_damaged_dataset_is_refused_before_a_run_is_created(tmp_path: Path, dataset: Path) -> None:
     file = dataset / "shard_00001" / "state.memmap"
     before = file.read_bytes()
     try:

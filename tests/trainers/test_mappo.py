@@ -1,4 +1,4 @@
-"""MAPPO as a whole run: what it begins with, what it leaves, what it refuses; and that it learns."""
+"""MAPPO as a whole run: its start, its results, what it refuses; and that it learns."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _scores(policy):
     return torch.cat((rollouts["error"], rollouts["reward"], rollouts["cohesion"]))
 
 
-def test_training_begins_with_exactly_the_policy_of_the_other_run(cloned, tmp_path, mappo_config):
+def test_training_starts_from_exactly_the_policy_of_init_from(cloned, tmp_path, mappo_config):
     config = resolve_model(mappo_config(tmp_path, init_from=str(cloned.path)))
     policy, expected = initial_policy(config), _scores(load_policy(cloned.path))
     assert config.model == ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
@@ -60,7 +60,7 @@ def test_training_begins_with_exactly_the_policy_of_the_other_run(cloned, tmp_pa
     assert not torch.equal(_scores(initial_policy(fresh)), expected)
 
 
-def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_with(cloned, tmp_path, mappo_config):
+def test_critic_warmup_leaves_the_policy_unchanged(cloned, tmp_path, mappo_config):
     run = train(mappo_config(tmp_path, init_from=str(cloned.path), rounds=2, critic_warmup=2), evaluate=False)
     assert run.config["model"]["name"] == "modgnn_mlp"
     assert torch.equal(_scores(load_policy(run.path)), _scores(load_policy(cloned.path)))
@@ -73,7 +73,7 @@ def test_a_run_in_which_only_the_critic_learns_ends_with_the_policy_it_began_wit
         ModelConfig(name="mpnn", hidden=8, layers=2),
     ],
 )
-def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, model, mappo_config):
+def test_the_seed_determines_a_run_and_global_generators_are_left_alone(tmp_path, model, mappo_config):
     runs = []
     for number, seed in enumerate((1, 1, 2)):
         torch.manual_seed(number)
@@ -84,7 +84,7 @@ def test_one_seed_fixes_a_run_and_torchs_own_generator_is_left_alone(tmp_path, m
     assert metrics[0] == metrics[1] != metrics[2]
 
 
-def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path, mappo_config):
+def test_a_checkpoint_holds_the_whole_state_of_a_run(tmp_path, mappo_config):
     run = train(mappo_config(tmp_path, env=FlockingConfig(num_agents=[3, 5], max_steps=15)), evaluate=False)
     checkpoint = load_checkpoint(run.checkpoints)
     of_learner = {"policy", "actor", "critic", "value_norm", "reference_policy", "optimizer", "generators"}
@@ -100,7 +100,7 @@ def test_a_checkpoint_holds_what_a_run_is_made_of(tmp_path, mappo_config):
     assert all(torch.equal(value, weights[name]) for name, value in checkpoint.tensors["policy"].items())
 
 
-def test_each_size_has_metrics_of_its_own(cloned, tmp_path, mappo_config):
+def test_each_size_has_its_own_metrics(cloned, tmp_path, mappo_config):
     env, pull = FlockingConfig(num_agents=[3, 5], max_steps=15), {"kl_coef": 0.2, "kl_rounds": 4}
     metrics = train(mappo_config(tmp_path, env=env, init_from=str(cloned.path), **pull), evaluate=False).read_metrics()
     assert [line["step"] for line in metrics] == [1, 2, 3]
@@ -123,7 +123,7 @@ def test_each_size_has_metrics_of_its_own(cloned, tmp_path, mappo_config):
 @pytest.mark.parametrize(
     "model", [ModelConfig(name="pair_force", hidden=8), ModelConfig(name="mpnn", hidden=8, layers=2)]
 )
-def test_it_flies_in_every_world(tmp_path, env, model, mappo_config):
+def test_it_trains_in_every_environment(tmp_path, env, model, mappo_config):
     for line in train(mappo_config(tmp_path, env=env, model=model), evaluate=False).read_metrics():
         assert all(value == value for name, value in line.items() if "separation" not in name), line
 
@@ -140,7 +140,7 @@ def test_it_flies_in_every_world(tmp_path, env, model, mappo_config):
         ({"trainer": DAggerConfig(gate="ensemble")}, "several policies cannot all start from that of init_from"),
     ],
 )
-def test_a_beginning_that_cannot_be_is_refused_before_anything_is_created(
+def test_an_impossible_start_is_refused_before_anything_is_created(
     cloned, tmp_path, monkeypatch, change, message, mappo_config
 ):
     monkeypatch.chdir(tmp_path)
@@ -161,8 +161,10 @@ def test_a_beginning_that_cannot_be_is_refused_before_anything_is_created(
         (BCConfig(cloning_steps=11, dart=True), "cloning_steps=11 is too short .* at least 12"),
     ],
 )
-def test_flights_that_hold_no_window_are_refused_before_anything_is_created(tmp_path, trainer, message, mappo_config):
-    """Learned messages of two layers are made anew from two steps before."""
+def test_rollouts_shorter_than_a_window_are_refused_before_anything_is_created(
+    tmp_path, trainer, message, mappo_config
+):
+    """Learned messages of two layers are recomputed from the two steps before."""
     config = mappo_config(tmp_path / "runs", model=ModelConfig(name="mpnn", layers=2))
     config.trainer = trainer
     with pytest.raises(InputError, match=message):
@@ -184,7 +186,7 @@ def test_a_fresh_policy_has_no_kl_penalty(tmp_path, mappo_config):
     assert not any("4/loss_kl" in line for line in metrics)
 
 
-def test_callbacks_can_stop_it(tmp_path, mappo_config):
+def test_callbacks_can_stop_training(tmp_path, mappo_config):
     class Stop(Callback):
         def on_round(self, index, metrics):
             return index == 2
@@ -194,7 +196,7 @@ def test_callbacks_can_stop_it(tmp_path, mappo_config):
 
 
 @pytest.mark.slow
-def test_the_command_trains_on(cloned, tmp_path):
+def test_the_command_continues_from_a_pretrained_policy(cloned, tmp_path):
     """As a user runs it: from the run folder of a cloned policy, with the trainer's own YAML."""
     small = ["num_envs=1", "rounds=1", "steps_per_round=4", "epochs=1", "num_minibatches=1", "critic_hidden=8"]
     command = [sys.executable, "-m", "modgnn_rl.train", "trainer=mappo", f"init_from={cloned.path}"]
@@ -209,7 +211,7 @@ def test_the_command_trains_on(cloned, tmp_path):
     assert "modgnn_mlp" in json.loads((folder / "evaluation.json").read_text())["3"]["rows"]
 
 
-def test_from_scratch_the_reward_rises(tmp_path, mappo_config):
+def test_the_reward_rises_from_scratch(tmp_path, mappo_config):
     """Where only effort costs, the best action is the velocity that one has."""
     others = {f"{name}_cost": 0.0 for name in ("leader", "cohesion", "crowding", "collision", "alignment")}
     env = FlockingConfig(num_agents=3, max_steps=100, effort_cost=1.0, **others)

@@ -79,7 +79,7 @@ def test_a_run_of_several_policies(tmp_path, bc_config):
     assert _equal(load_policy(run.path), load_policy(run.path / NAMES[0]))
 
 
-def test_one_seed_fixes_a_run_of_several_policies(tmp_path, bc_config):
+def test_the_seed_determines_a_run_of_several_policies(tmp_path, bc_config):
     metrics = [
         train(bc_config(tmp_path, **SEVERAL, cloning_updates=2), evaluate=False).metrics_file.read_bytes()
         for _ in range(2)
@@ -87,8 +87,8 @@ def test_one_seed_fixes_a_run_of_several_policies(tmp_path, bc_config):
     assert metrics[0] == metrics[1]
 
 
-def test_a_policy_trained_beside_others_is_the_one_trained_alone(tmp_path, bc_config):
-    """The first of several seeds draws; its data, weights and batches are those of a run of its own."""
+def test_a_policy_trained_beside_others_equals_the_one_trained_alone(tmp_path, bc_config):
+    """All random numbers come from the first of several seeds, whose data, weights and batches are as if alone."""
     model = ModelConfig(name="mpnn", layers=2, hidden=8)
     alone = train(bc_config(tmp_path, model=model), evaluate=False)
     several = train(bc_config(tmp_path, model=model, seeds=2), evaluate=False)
@@ -110,7 +110,7 @@ def test_names_and_seeds_of_the_members(bc_config):
     assert list(member_configs(bc_config("runs", seeds=2))) == ["pair_force-K1-seed0", "pair_force-K1-seed1"]
 
 
-def test_members_are_trained_by_what_they_are_told_to(tmp_path, bc_config):
+def test_each_policy_is_trained_with_its_own_settings(tmp_path, bc_config):
     class Start(Callback):
         def on_start(self, policies):
             self.policies = {
@@ -143,19 +143,19 @@ def test_what_cannot_be_trained_is_refused_before_anything_is_created(tmp_path, 
     assert not list(tmp_path.iterdir())
 
 
-def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path, monkeypatch, bc_config):
-    flown, forward = [], ActionNoise.forward
+def test_dart_collects_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path, monkeypatch, bc_config):
+    scales, forward = [], ActionNoise.forward
 
     def watched(self, tensordict):
-        if not flown or flown[-1] != self.scale:
-            flown.append(self.scale)
+        if not scales or scales[-1] != self.scale:
+            scales.append(self.scale)
         return forward(self, tensordict)
 
     monkeypatch.setattr(ActionNoise, "forward", watched)
     metrics = train(bc_config(tmp_path, dart=True, noise=0.1, cloning_updates=40), evaluate=False).read_metrics()
-    # Tried out, and flown for validation, without noise; each part with the error of the round before it.
+    # Construction and validation are without noise; each part has the error of the round before it.
     after = [metrics[index]["4/validation_loss"] ** 0.5 for index in (9, 19, 29)]
-    assert flown == pytest.approx([0.0, 0.1, 0.0, *after])
+    assert scales == pytest.approx([0.0, 0.1, 0.0, *after])
     # The metric is the noise in the data of that part.
     expected = [noise for noise in (0.1, *after) for _ in range(10)]
     assert [line["noise"] for line in metrics] == pytest.approx(expected)
@@ -163,7 +163,7 @@ def test_dart_flies_in_four_parts_with_the_error_of_the_policy_as_noise(tmp_path
 
 @pytest.mark.parametrize("rounds", [2, 6])
 @pytest.mark.parametrize(("settings", "sets"), [({}, 1), ({"dart": True}, 4)])
-def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settings, sets, rounds, bc_config):
+def test_dart_collects_as_much_data_as_plain_cloning(tmp_path, monkeypatch, settings, sets, rounds, bc_config):
     seen, extend = [], RolloutBuffer.extend
 
     def watched(self, rollouts):
@@ -178,7 +178,7 @@ def test_the_data_are_as_many_with_dart_as_without(tmp_path, monkeypatch, settin
     assert of_training[-1][2] == 8 * 12
 
 
-def _flights(policies, **settings):
+def _collected(policies, **settings):
     trainer = BCConfig(**{"num_envs": 1, "batch_size": 8, "ema_decay": 0.8, **settings})
     spec = RolloutSpec(training_env_factory(ENV), 6, 4, steps=12, seed=0)
     data = make_buffer(spec, trainer, policies, Reynolds(), hold_steps=12)
@@ -194,16 +194,16 @@ def _flights(policies, **settings):
         [("pair_force", {}), ("pair_force", {}), ("pair_force", {})],  # at once, from stored messages
     ],
 )
-def test_fitting_together_is_fitting_each_alone_on_the_same_batches(models):
+def test_fitting_together_equals_fitting_each_alone_on_the_same_batches(models):
     def policies():
         return [make_model(name, hidden=8, seed=seed, **model) for seed, (name, model) in enumerate(models)]
 
-    trainer, buffer = _flights(policies(), hide_velocity=0.0)
+    trainer, buffer = _collected(policies(), hide_velocity=0.0)
     together = [ImitationLearner(policy, trainer, (12, 12), seed=0) for policy in policies()]
     losses = fit_together(together, buffer, 12)
     final = validate_together(together, buffer)
     for number, policy in enumerate(policies()):
-        _, buffer = _flights(policies())  # the same data, and the same draws of batches
+        _, buffer = _collected(policies())  # the same data and the same batches
         alone = ImitationLearner(policy, trainer, (12, 12), seed=0)
         assert fit_together([alone], buffer, 12)[0] == pytest.approx(losses[number], rel=1e-4)
         assert alone.validate(buffer) == pytest.approx(final[number], rel=1e-3)
@@ -216,7 +216,7 @@ def test_fitting_together_is_fitting_each_alone_on_the_same_batches(models):
         assert together[number].learning_rate == alone.learning_rate
 
 
-def test_each_policy_has_its_folder_after_an_interruption_too(tmp_path, bc_config):
+def test_each_policy_has_its_folder_even_after_an_interruption(tmp_path, bc_config):
     class Interrupt(Callback):
         def on_round(self, index, metrics):
             raise KeyboardInterrupt

@@ -142,7 +142,7 @@ def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
         assert result[2] == pytest.approx(alone[2], rel=1e-9)
 
 
-def test_improving_on_parts_of_the_flights_is_improving_on_the_whole(tmp_path):
+def test_updates_on_parts_of_the_rollouts_are_the_updates_on_the_whole(tmp_path):
     settings = MAPPOConfig(num_minibatches=1, epochs=3, agents_per_state=100, critic_hidden=8, learning_rate=1e-2)
     actor = GaussianActor(make_model("moment_force", seed=0), 0.3)
     spec = RolloutSpec(training_env_factory(ENV), 4, 4, steps=10, seed=0)
@@ -167,7 +167,7 @@ def test_improving_on_parts_of_the_flights_is_improving_on_the_whole(tmp_path):
         _assert_close(alone, result)
 
 
-def test_all_refuse_what_is_no_number_in_one_process(tmp_path):
+def test_a_nan_in_one_process_is_handled_by_all(tmp_path):
     settings = DAggerConfig(on_nonfinite="skip")
     policy = make_model("gcn", seed=0)
     spec = RolloutSpec(training_env_factory(ENV), 4, 6, steps=20, seed=0)
@@ -215,7 +215,7 @@ def test_means_over_processes(tmp_path):
         assert flags == [True, True, False]
 
 
-def test_what_does_not_count_in_one_process_does_not_matter(tmp_path):
+def test_a_process_of_weight_zero_is_ignored(tmp_path):
     def reduce():
         first = distributed.rank() == 0
         parameter = torch.zeros(2, requires_grad=True)
@@ -226,7 +226,7 @@ def test_what_does_not_count_in_one_process_does_not_matter(tmp_path):
     assert _in_two_processes(tmp_path, reduce) == [[1.0, 2.0, 3.0]] * 2
 
 
-def test_weights_that_drift_apart_are_noticed(tmp_path):
+def test_diverging_weights_are_detected(tmp_path):
     def check():
         weights = torch.ones(5)
         distributed.check_alike([weights], "after round 3")
@@ -285,7 +285,7 @@ def test_a_run_of_two_processes(tmp_path, name, small_config):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
-def test_a_signal_to_one_process_stops_all_and_the_run_goes_on(tmp_path, name, small_config):
+def test_a_signal_to_one_process_stops_all_and_the_run_resumes(tmp_path, name, small_config):
     config = small_config(tmp_path / "runs", name, **{"env": ENV, "model": ModelConfig(), **RUNS[name]})
     spying = {"stop_at": 1, "stops": 1}
     results = _in_two_processes(tmp_path, lambda: _train(config, **spying), as_torchrun=True)

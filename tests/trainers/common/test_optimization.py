@@ -1,4 +1,4 @@
-"""The optimiser never steps along what is no number."""
+"""NaN and infinity never reach the weights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _batch():
     return TensorDict({"agents": agents, "messages": messages}, [4, 2])
 
 
-def _stepper(on_nonfinite):
+def _optimizer(on_nonfinite):
     model = nn.Linear(6, 1)
     settings = DAggerConfig(on_nonfinite=on_nonfinite, max_grad_norm=0.5)
     return GuardedOptimizer(model, torch.optim.SGD(model.parameters(), lr=1.0), settings), model
@@ -35,68 +35,68 @@ def _backward(model, batch):
     return loss
 
 
-def _spoil_data(model, batch):
+def _corrupt_data(model, batch):
     batch["agents", "observation"][2, 1, 0, 4] = math.nan
     return _backward(model, batch)
 
 
-def _spoil_loss(model, batch):
+def _corrupt_loss(model, batch):
     with torch.no_grad():
         model.weight[0, 0] = math.inf
     return _backward(model, batch)
 
 
-def _spoil_gradient(model, batch):
+def _corrupt_gradient(model, batch):
     loss = _backward(model, batch)
     model.bias.grad.fill_(math.nan)
     return loss
 
 
-SPOILT = {
-    r"\('agents', 'observation'\) of agent 0 at step 1 of window 2 of its data is nan": _spoil_data,
-    "its loss is (inf|nan) although its data are finite": _spoil_loss,
-    "the gradient of bias is not finite": _spoil_gradient,
+CORRUPTIONS = {
+    r"\('agents', 'observation'\) of agent 0 at step 1 of window 2 of its data is nan": _corrupt_data,
+    "its loss is (inf|nan) although its data are finite": _corrupt_loss,
+    "the gradient of bias is not finite": _corrupt_gradient,
 }
 
 
 def test_a_finite_gradient_is_clipped_and_stepped_along():
-    stepper, model = _stepper("stop")
+    optimizer, model = _optimizer("stop")
     batch = _batch()
     loss = _backward(model, batch)
     norm = torch.cat([p.grad.flatten() for p in model.parameters()]).norm()
     before = torch.cat([p.detach().flatten() for p in model.parameters()])
-    assert stepper.step(1, loss, batch, ALL)
+    assert optimizer.step(1, loss, batch, ALL)
     moved = (torch.cat([p.detach().flatten() for p in model.parameters()]) - before).norm()
-    assert stepper.gradient_norm == pytest.approx(float(norm))
+    assert optimizer.gradient_norm == pytest.approx(float(norm))
     assert float(moved) == pytest.approx(min(0.5, float(norm)), rel=1e-4)
 
 
 @pytest.mark.parametrize("on_nonfinite", ["stop", "skip"])
-@pytest.mark.parametrize("message", SPOILT)
-def test_no_step_is_taken_and_what_is_wrong_is_named(message, on_nonfinite):
-    stepper, model = _stepper(on_nonfinite)
+@pytest.mark.parametrize("message", CORRUPTIONS)
+def test_no_step_is_taken_and_the_cause_is_named(message, on_nonfinite):
+    optimizer, model = _optimizer(on_nonfinite)
     batch = _batch()
-    loss = SPOILT[message](model, batch)
+    loss = CORRUPTIONS[message](model, batch)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     if on_nonfinite == "stop":
         with pytest.raises(NotFinite, match=f"update 7 was not made because {message}"):
-            stepper.step(7, loss, batch, ALL)
+            optimizer.step(7, loss, batch, ALL)
     else:
         with pytest.warns(RuntimeWarning, match=message):
-            assert not stepper.step(7, loss, batch, ALL)
+            assert not optimizer.step(7, loss, batch, ALL)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
 
-def test_too_many_in_a_row_stop_and_one_good_one_counts_anew():
-    stepper, model = _stepper("skip")
+def test_too_many_skipped_updates_in_a_row_stop_training():
+    optimizer, model = _optimizer("skip")
 
     def skip(times):
         for _ in range(times):
             with pytest.warns(RuntimeWarning, match="training continues"):
-                stepper.step(1, _spoil_gradient(model, _batch()), _batch(), ALL)
+                optimizer.step(1, _corrupt_gradient(model, _batch()), _batch(), ALL)
 
     skip(MAX_SKIPPED - 1)
-    assert stepper.step(1, _backward(model, _batch()), _batch(), ALL)
+    assert optimizer.step(1, _backward(model, _batch()), _batch(), ALL)
     skip(MAX_SKIPPED - 1)
     with pytest.raises(NotFinite, match="resume with smaller steps"):
-        stepper.step(1, _spoil_gradient(model, _batch()), _batch(), ALL)
+        optimizer.step(1, _corrupt_gradient(model, _batch()), _batch(), ALL)

@@ -1,4 +1,4 @@
-"""The learner: its learning rate, its moving average, its determinism."""
+"""The learner of imitation: learning rate, moving average, determinism."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _learner(**settings):
     return ImitationLearner(make_model("pair_force", seed=0), DAggerConfig(batch_size=64, **settings), (20, 60), seed=0)
 
 
-def test_learning_rate_passes_its_three_values_without_jumps():
+def test_the_learning_rate_passes_its_three_values_without_jumps():
     rates = [cosine_learning_rate(step, RATES, (20, 60)) for step in range(80)]
     assert rates[0] == pytest.approx(RATES[0])
     assert rates[20] == pytest.approx(RATES[1])
@@ -39,7 +39,7 @@ def test_learning_rate_passes_its_three_values_without_jumps():
     assert all(b <= a for a, b in itertools.pairwise(rates))
 
 
-def test_fitting_lowers_the_loss_and_the_optimiser_goes_on(rollouts):
+def test_fitting_lowers_the_loss(rollouts):
     rollouts.extend(rollouts.collect(1.0))
     learner = _learner()
     before = learner.validate(rollouts.buffer)
@@ -49,7 +49,7 @@ def test_fitting_lowers_the_loss_and_the_optimiser_goes_on(rollouts):
     assert learner.learning_rate == pytest.approx(RATES[2])
 
 
-def test_what_flies_is_the_moving_average_of_the_weights(rollouts):
+def test_the_acting_policy_has_the_moving_average_of_the_weights(rollouts):
     rollouts.extend(rollouts.collect(1.0))
     learner = _learner(ema_decay=0.9)
     expected = copy.deepcopy(learner.policy.state_dict())
@@ -61,7 +61,7 @@ def test_what_flies_is_the_moving_average_of_the_weights(rollouts):
         torch.testing.assert_close(value, expected[key])
 
 
-def test_one_seed_fixes_the_weights():
+def test_the_seed_determines_the_weights():
     weights = []
     for _ in range(2):
         settings = DAggerConfig(capacity=500, batch_size=64)
@@ -74,5 +74,5 @@ def test_one_seed_fixes_the_weights():
     assert torch.equal(*weights)
 
 
-def test_no_updates_are_no_loss(rollouts):
+def test_without_updates_the_loss_is_nan(rollouts):
     assert torch.isnan(torch.tensor(_learner().fit(rollouts.buffer, 0)))

@@ -41,8 +41,8 @@ def _batch(window, messages=None):
 
 
 @pytest.mark.parametrize("name", ["pair_force", "modgnn_mlp", "gcn"])
-def test_loss_and_gradient_of_some_receivers_are_those_of_the_whole_flock(name):
-    """Dropping the links to the others is an economy, never another loss."""
+def test_loss_and_gradient_of_some_receivers_equal_those_of_the_whole_flock(name):
+    """Dropping the edges to the others saves time and does not change the loss."""
     policy = make_model(name, hops=2, seed=0)
     batch = _batch(1, messages=2)
     receivers = random_receivers(batch["agents", "controlled"][:, -1], 3, torch.Generator().manual_seed(1))
@@ -57,15 +57,15 @@ def test_loss_and_gradient_of_some_receivers_are_those_of_the_whole_flock(name):
         torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-6)
 
 
-def test_the_loss_leaves_the_batch_alone():
+def test_the_loss_does_not_change_the_batch():
     batch = _batch(1, messages=1)
     before = batch.clone()
     imitation_loss(make_model("gcn", seed=0), batch, batch["agents", "controlled"][:, -1])
     assert (batch == before).all()
 
 
-def test_stored_messages_and_messages_made_anew_give_the_same_gradient():
-    """A policy that sends plain data may train on stored messages; a window that makes them anew agrees with it."""
+def test_stored_and_recomputed_messages_give_the_same_gradient():
+    """A policy that sends plain data may train on stored messages; a window that recomputes them agrees with it."""
     policy = make_model("modgnn_mlp", hops=2, seed=0)
     window = _batch(3)
     agents, adjacency = window["agents", "observation"], window["adjacency"]
@@ -91,7 +91,7 @@ def test_a_learned_f_input_gets_its_gradient_through_the_window():
 
 
 @given(count=st.integers(1, 12), agents=st.integers(1, 9), seed=st.integers(0, 1000))
-def test_receivers_are_controlled_and_as_many_as_asked_for(count, agents, seed):
+def test_receivers_are_controlled_agents_in_the_number_asked_for(count, agents, seed):
     generator = torch.Generator().manual_seed(seed)
     controlled = torch.rand(6, agents, generator=generator) < 0.7
     receivers = random_receivers(controlled, count, generator)
@@ -99,7 +99,7 @@ def test_receivers_are_controlled_and_as_many_as_asked_for(count, agents, seed):
     assert (receivers.sum(-1) == controlled.sum(-1).clamp(max=count)).all()
 
 
-def test_every_controlled_agent_gets_its_turn():
+def test_every_controlled_agent_is_chosen_equally_often():
     controlled = torch.tensor([False, True, True, True, True]).expand(4000, 5)
     share = random_receivers(controlled, 2, torch.Generator().manual_seed(0)).float().mean(0)
     torch.testing.assert_close(share, torch.tensor([0.0, 0.5, 0.5, 0.5, 0.5]), atol=0.03, rtol=0)
@@ -115,7 +115,7 @@ def test_rotations_are_rotations_and_uniform():
     assert (rotations.square().mean(0) - 1 / 3).abs().max() < 0.03
 
 
-def test_rotate_turns_each_vector_by_the_matrix_of_its_sample():
+def test_rotate_applies_the_matrix_of_each_sample_to_its_vectors():
     rotations = random_rotations(4, torch.zeros(()), torch.Generator().manual_seed(0))
     data = torch.randn(4, 1, 5, 6, generator=torch.Generator().manual_seed(1))
     turned = rotate(data, rotations)
@@ -136,8 +136,8 @@ def test_rotate_turns_each_vector_by_the_matrix_of_its_sample():
         ("gat", {}),
     ],
 )
-def test_stored_messages_teach_what_windows_teach(name, model):
-    """Of rollouts with ends in the middle, from messages as they were flown and as windows make them."""
+def test_training_on_stored_messages_equals_training_on_windows(name, model):
+    """For rollouts with resets in the middle: messages as collected, and as recomputed in windows."""
     policy = make_model(name, hidden=8, seed=0, **model)
     settings = DAggerConfig(stride=3, capacity=1000, batch_size=16)
     spec = RolloutSpec(training_env_factory(FlockingConfig(max_steps=6)), 4, 4, steps=13, seed=0)
@@ -146,10 +146,10 @@ def test_stored_messages_teach_what_windows_teach(name, model):
     assert data.windows.window == 1
     rollouts = data.collect(0.3)
     assert bool(rollouts["is_init"][:, policy.window :].any())
-    made_anew = slice_windows(rollouts.exclude("messages"), policy.window, stride=3)
+    recomputed = slice_windows(rollouts.exclude("messages"), policy.window, stride=3)
     stored = slice_windows(rollouts, 1, stride=1).view(4, 13)[:, policy.window - 1 :: 3].reshape(-1, 1)
     receivers = stored["agents", "controlled"][:, -1]
-    losses = [imitation_loss(policy, batch, receivers) for batch in (made_anew, stored)]
+    losses = [imitation_loss(policy, batch, receivers) for batch in (recomputed, stored)]
     torch.testing.assert_close(losses[0], losses[1])
     gradients = [torch.autograd.grad(loss, list(policy.parameters()), allow_unused=True) for loss in losses]
     for mine, theirs in zip(*gradients, strict=True):
@@ -170,7 +170,7 @@ def test_learned_messages_are_not_stored(name, model):
     ("name", "model", "window"),
     [("pair_force", {}, 1), ("moment_force", {}, 3), ("modgnn_mlp", {"hops": 2}, 3), ("gcn", {"layers": 2}, 3)],
 )
-def test_stacked_losses_are_those_of_a_loop_with_its_gradients(name, model, window):
+def test_stacked_losses_and_gradients_equal_those_of_a_loop(name, model, window):
     batch = _batch(window)
     receivers = random_receivers(batch["agents", "controlled"][:, -1], 3, torch.Generator().manual_seed(1))
     receivers[0] = False  # a flock without receivers
@@ -190,7 +190,7 @@ def test_stacked_losses_are_those_of_a_loop_with_its_gradients(name, model, wind
 
 
 @given(share=st.sampled_from([0.0, 0.3, 1.0]), seed=st.integers(0, 1000))
-def test_velocities_are_hidden_of_all_agents_and_steps_of_a_window_or_of_none(share, seed):
+def test_velocities_of_a_window_are_hidden_all_or_none(share, seed):
     batch = _batch(3)
     before = batch.clone()
     hide_velocities(batch, share, torch.Generator().manual_seed(seed))
@@ -205,7 +205,7 @@ def test_velocities_are_hidden_of_all_agents_and_steps_of_a_window_or_of_none(sh
         assert torch.equal(batch[key], before[key])
 
 
-def test_velocities_are_hidden_in_the_stated_share_of_windows():
+def test_velocities_are_hidden_in_the_given_fraction_of_windows():
     batch = torch.cat([_batch(1) for _ in range(200)])
     hide_velocities(batch, 0.3, torch.Generator().manual_seed(0))
     hidden = (batch["agents", "observation"][..., 3:] == 0).flatten(1).all(1)

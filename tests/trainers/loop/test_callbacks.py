@@ -1,4 +1,4 @@
-"""Where people's own code is called, what it can do there, and an expert of one's own."""
+"""Callbacks: when they are called and what they can do; early stopping; custom experts."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class _Watch(Callback):
 
 
 @pytest.mark.parametrize("name", ROUNDS)
-def test_the_four_places(tmp_path, name, small_config):
+def test_every_callback_method_is_called(tmp_path, name, small_config):
     watch = _Watch()
     run = train(small_config(tmp_path, name), callbacks=[watch], evaluate=False)
     kinds = {kind: [value for called, value in watch.calls if called == kind] for kind, _ in watch.calls}
@@ -66,7 +66,7 @@ def test_the_four_places(tmp_path, name, small_config):
 
 
 @pytest.mark.parametrize("name", ROUNDS)
-def test_any_of_several_callbacks_stops_the_training_and_all_are_called(tmp_path, name, small_config):
+def test_any_callback_stops_training_and_all_are_called(tmp_path, name, small_config):
     watches = [_Watch(), _Watch(stop_at=2), _Watch()]
     run = train(small_config(tmp_path, name), callbacks=watches, evaluate=False)
     assert run.read_metrics()[-1]["step"] == 2
@@ -76,7 +76,7 @@ def test_any_of_several_callbacks_stops_the_training_and_all_are_called(tmp_path
 
 
 @pytest.mark.parametrize("name", ["bc", "dagger"])
-def test_what_a_callback_changes_in_the_flights_is_learned_from(tmp_path, name, small_config):
+def test_changes_of_rollouts_by_a_callback_affect_training(tmp_path, name, small_config):
     class Zero(Callback):
         def on_collect(self, index, rollouts):
             rollouts["agents", "expert_action"].zero_()
@@ -88,7 +88,7 @@ def test_what_a_callback_changes_in_the_flights_is_learned_from(tmp_path, name, 
     assert losses[0] != losses[1]
 
 
-def test_a_callback_that_fails_ends_the_run_with_its_own_error(tmp_path, small_config):
+def test_an_error_in_a_callback_ends_the_run(tmp_path, small_config):
     class Fail(_Watch):
         def on_round(self, index, metrics):
             raise RuntimeError("mine")
@@ -108,30 +108,30 @@ def _steps_until_stop(values, **settings):
     return None
 
 
-def test_a_plateau_is_where_the_mean_falls_less_than_the_gain():
+def test_a_plateau_is_a_decrease_of_the_mean_below_the_gain():
     falling = [0.8**k for k in range(20)]
     assert _steps_until_stop(falling) is None
     assert _steps_until_stop([1.0] * 20) == 4  # two rounds, and two before them
-    assert _steps_until_stop([1.0, 1.0, 0.89, 0.89, 0.89, 0.89]) == 5  # 0.89 / 0.945 is no tenth less
+    assert _steps_until_stop([1.0, 1.0, 0.89, 0.89, 0.89, 0.89]) == 5  # 0.89 / 0.945 is not a tenth less
     assert _steps_until_stop([1.0, 1.0, 0.91, 0.91]) == 4
     assert _steps_until_stop([1.0] * 20, gain=0.0) is None  # not above what was
     assert _steps_until_stop([1.0, 1.0, 1.0, 1.1], gain=0.0) == 4
     assert _steps_until_stop([1.0] * 20, rounds=5) == 10
 
 
-def test_rounds_without_the_metric_and_the_first_ones_do_not_count():
+def test_rounds_without_the_metric_and_early_rounds_do_not_count():
     assert _steps_until_stop([math.nan, 1.0, {}, 1.0, math.nan, 1.0, 1.0]) == 7
     assert _steps_until_stop([1.0] * 20, after=6) == 10
 
 
-def test_a_plateau_may_be_that_of_another_metric():
+def test_the_plateau_of_another_metric():
     metrics = [{"error": 0.7**k, "8/error": 1.0} for k in range(20)]
     assert _steps_until_stop(metrics) is None
     assert _steps_until_stop(metrics, name="8/error") == 4
 
 
 @pytest.mark.parametrize("name", ["dagger", "mappo"])
-def test_the_error_of_a_round_is_the_mean_over_the_sizes(tmp_path, name, small_config):
+def test_the_error_of_a_round_is_the_mean_over_sizes(tmp_path, name, small_config):
     config = small_config(tmp_path, name, env=FlockingConfig(num_agents=[3, 4]))
     run = train(config, evaluate=False)
     for line in run.read_metrics():
@@ -141,7 +141,7 @@ def test_the_error_of_a_round_is_the_mean_over_the_sizes(tmp_path, name, small_c
 
 
 @pytest.mark.parametrize("name", ["bc", "dagger"])
-def test_an_expert_of_ones_own_is_learned_from_and_evaluated_against(tmp_path, name, small_config):
+def test_a_custom_expert_is_imitated_and_evaluated_against(tmp_path, name, small_config):
     """It stands still; the trained policy does too, and its errors are against it."""
     still = TensorDictModule(
         lambda observation: 0.0 * observation[..., :3],

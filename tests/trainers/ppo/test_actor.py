@@ -1,4 +1,4 @@
-"""The exploring actor against torch's own normal distribution, and against the policy that it is made of."""
+"""The exploring actor against torch's normal distribution, and against its policy."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _actor(name="modgnn_mlp", noise=0.3):
     return GaussianActor(make_model(name, hops=HOPS, hidden=8, seed=0), noise)
 
 
-def test_the_log_probability_is_that_of_a_normal_distribution_of_all_components():
+def test_the_log_probability_is_that_of_a_normal_distribution():
     actor = _actor(noise=0.4)
     torch.manual_seed(0)
     agents = actor(_step())["agents"]
@@ -47,7 +47,7 @@ def test_the_log_probability_is_that_of_a_normal_distribution_of_all_components(
     torch.testing.assert_close(agents["scale"], torch.full_like(mean, 0.4))
 
 
-def test_draws_have_the_stated_mean_and_standard_deviation():
+def test_samples_have_the_given_mean_and_standard_deviation():
     actor, data = _actor(noise=0.4), _step()
     torch.manual_seed(0)
     deviation = torch.stack([actor(data.clone())["agents", "action"] for _ in range(60)]) - actor(data)["agents", "loc"]
@@ -57,7 +57,7 @@ def test_draws_have_the_stated_mean_and_standard_deviation():
 
 
 @pytest.mark.parametrize("name", ["pair_force", "moment_force", "modgnn_mlp", "mpnn"])
-def test_without_exploration_it_acts_exactly_as_the_policy(name):
+def test_without_exploration_it_acts_exactly_like_the_policy(name):
     policy = make_model(name, hidden=8, seed=0)
     actor, data = GaussianActor(policy), _step().exclude("messages")
     data["is_init"].fill_(True)
@@ -73,7 +73,7 @@ def test_exploring_does_not_change_the_messages():
     assert torch.equal(actor(data.clone())["next", "messages"], actor.policy(data.clone())["next", "messages"])
 
 
-def test_means_of_receivers_are_those_computed_for_all_and_the_others_are_zero():
+def test_means_of_receivers_are_exact_and_others_are_zero():
     actor, window = _actor("mpnn"), _step(4).exclude("messages")
     receivers = torch.rand(FLOCKS, 4, AGENTS, generator=torch.Generator().manual_seed(1)) < 0.4
     with set_recurrent_mode(True):
@@ -85,7 +85,7 @@ def test_means_of_receivers_are_those_computed_for_all_and_the_others_are_zero()
     assert torch.equal(some.stddev, everyone.stddev)
 
 
-def test_the_policy_is_used_and_not_copied():
+def test_the_policy_is_not_copied():
     policy = make_model("gcn", hops=HOPS, seed=0)
     actor = GaussianActor(policy, 0.2)
     assert actor.policy is policy
@@ -112,7 +112,7 @@ def test_the_log_probability_has_the_gradients_of_the_formula():
     assert actor.noise == pytest.approx(0.8)
 
 
-def test_sigma_is_learned_beside_the_policy():
+def test_sigma_is_learned_with_the_policy():
     actor = _actor()
     before = copy.deepcopy(actor.state_dict())
     optimizer = torch.optim.SGD(actor.parameters(), lr=0.1)

@@ -41,14 +41,14 @@ def test_permuting_the_followers_permutes_the_values(critic, seed, agents):
     torch.testing.assert_close(_values(critic, state[:, order]), _values(critic, state)[:, order])
 
 
-def test_the_leader_is_no_follower(critic):
+def test_the_leader_cannot_be_swapped_with_a_follower(critic):
     state = _states(2, 5)
     swapped = state[:, [1, 0, 2, 3, 4]]
     assert (_values(critic, swapped)[:, 2:] - _values(critic, state)[:, 2:]).abs().min() > 1e-4
 
 
 @given(seed=st.integers(0, 1000), agents=st.integers(1, 6), mirrored=st.booleans())
-def test_values_feel_no_translation_rotation_or_reflection(critic, seed, agents, mirrored):
+def test_values_are_invariant_to_translation_rotation_and_reflection(critic, seed, agents, mirrored):
     generator = torch.Generator().manual_seed(seed)
     state = _states(3, agents, seed)
     matrices = random_rotations(3, state, generator)
@@ -57,7 +57,7 @@ def test_values_feel_no_translation_rotation_or_reflection(critic, seed, agents,
     torch.testing.assert_close(_values(critic, moved), _values(critic, state), rtol=1e-6, atol=1e-8)
 
 
-def test_values_feel_what_matters(critic):
+def test_values_depend_on_every_agents_position_and_velocity(critic):
     """Else the laws above would hold of a critic that sees nothing."""
     state = _states(1, 5)
     for agent in range(5):
@@ -68,15 +68,15 @@ def test_values_feel_what_matters(critic):
 
 
 @given(seed=st.integers(0, 1000), agents=st.integers(1, 5), others=st.integers(1, 4))
-def test_agents_that_do_not_exist_are_as_if_they_were_not_there(critic, seed, agents, others):
+def test_agents_that_do_not_exist_do_not_affect_values(critic, seed, agents, others):
     state = _states(2, agents, seed)
-    rubbish = 1e4 * (1 + torch.rand(2, others, 6, generator=torch.Generator().manual_seed(seed), dtype=DOUBLE))
+    garbage = 1e4 * (1 + torch.rand(2, others, 6, generator=torch.Generator().manual_seed(seed), dtype=DOUBLE))
     mask = (torch.arange(agents + others) < agents).expand(2, -1)
-    values = _values(critic, torch.cat((state, rubbish), 1), mask)
+    values = _values(critic, torch.cat((state, garbage), 1), mask)
     torch.testing.assert_close(values[:, :agents], _values(critic, state))
 
 
-def test_rubbish_reaches_no_gradient(critic):
+def test_agents_that_do_not_exist_do_not_affect_gradients(critic):
     state = torch.cat((_states(2, 3), torch.full((2, 1, 6), 1e4, dtype=DOUBLE)), 1)
     mask = torch.tensor([True, True, True, False]).expand(2, 4)
     gradients = []
@@ -99,7 +99,7 @@ def test_any_number_of_agents_and_any_leading_dimensions(agents):
 
 
 @pytest.mark.parametrize("there", [0, 1, 3])
-def test_masked_pooling_is_the_pooling_of_the_smaller_flock(there):
+def test_masked_pooling_equals_pooling_of_the_smaller_flock(there):
     network = PooledCritic(4, hidden=8).double()
     features = torch.randn(2, 5, 4, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
     mask = (torch.arange(5) < there).expand(2, 5)
@@ -110,8 +110,8 @@ def test_masked_pooling_is_the_pooling_of_the_smaller_flock(there):
     torch.testing.assert_close(network(features, torch.ones(2, 5, dtype=torch.bool)), network(features))
 
 
-def test_features_of_a_flock_drawn_by_hand():
-    """The leader rests at the origin; a follower, 3 m east, flies west at 1 m/s, another, 0.2 m behind it, rests."""
+def test_features_of_a_flock_computed_by_hand():
+    """The leader rests at the origin; a follower 3 m east of it moves west at 1 m/s; another, 0.2 m behind, rests."""
     state = torch.zeros(1, 3, 6, dtype=DOUBLE)
     state[0, 1, 0], state[0, 1, 3], state[0, 2, 0] = 3.0, -1.0, 3.2
     features = flock_features(state)[0]

@@ -16,17 +16,17 @@ from modgnn_rl.envs.flocking.task import training_env_factory
 from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
 from modgnn_rl.trainers.ppo.learner import RECEIVERS, PPOLearner
 
-WORLD = FlockingConfig(max_steps=8)  # rollouts end in the middle of the rounds
+ENV = FlockingConfig(max_steps=8)  # rollouts end in the middle of the rounds
 FLOCKS, AGENTS, STEPS = 4, 5, 10
 
 
-def _learner(name="pair_force", *, model=None, env_config=WORLD, **settings):
+def _learner(name="pair_force", *, model=None, env_config=ENV, **settings):
     policy = make_model(name, hidden=8, seed=0, **(model or {}))
     small = {"window": 3, "epochs": 1, "num_minibatches": 2, "critic_hidden": 8}
     return PPOLearner(policy, MAPPOConfig(**{**small, **settings}), env_config.state_key, seed=0)
 
 
-def _collector(learner, *, env_config=WORLD, steps=STEPS):
+def _collector(learner, *, env_config=ENV, steps=STEPS):
     spec = RolloutSpec(training_env_factory(env_config), FLOCKS, AGENTS, steps, seed=0)
     return LocalCollector(spec, (learner.actor, Reynolds.for_env(env_config)))
 
@@ -39,8 +39,8 @@ def _weights(module):
     ("name", "model"),
     [("mpnn", {}), ("mpnn", {"layers": 2}), ("pair_force", {"layers": 2}), ("modgnn_mlp", {"hops": 2})],
 )
-@pytest.mark.parametrize("env_config", [WORLD, FlockingConfig(max_steps=8, dropout_rate=2.0, delay=1)])
-def test_before_the_first_update_what_was_flown_is_recomputed_exactly(name, model, env_config):
+@pytest.mark.parametrize("env_config", [ENV, FlockingConfig(max_steps=8, dropout_rate=2.0, delay=1)])
+def test_before_the_first_update_the_collected_actions_are_recomputed_exactly(name, model, env_config):
     learner = _learner(name, model=model, env_config=env_config)
     collector = _collector(learner, env_config=env_config)
     before, began = copy.deepcopy(learner.actor.state_dict()), 0
@@ -53,7 +53,7 @@ def test_before_the_first_update_what_was_flown_is_recomputed_exactly(name, mode
     assert torch.equal(_weights(learner.ema_policy), _weights(learner.policy))
 
 
-def test_without_burn_in_learned_messages_would_not_be_those_flown():
+def test_without_burn_in_learned_messages_would_differ_from_those_collected():
     """What the law above guards against: messages that came into a round are of older weights."""
     learner = _learner("mpnn", model={"layers": 2})
     assert learner.burn_in == 2
@@ -86,8 +86,8 @@ def _gae(reward, value, next_value, done, discount, trace):
     return advantage
 
 
-@pytest.mark.parametrize("env_config", [WORLD, FlockingConfig(max_steps=8, dropout_rate=2.0)])
-def test_advantages_are_those_of_a_loop(env_config):
+@pytest.mark.parametrize("env_config", [ENV, FlockingConfig(max_steps=8, dropout_rate=2.0)])
+def test_advantages_equal_those_of_a_loop(env_config):
     learner = _learner(gamma=0.9, gae_lambda=0.8, env_config=env_config)
     rollouts = _collector(learner, env_config=env_config).collect()
     rollouts["next", "terminated"][1, 4] = rollouts["next", "done"][1, 4] = True  # two ends that are no truncation
@@ -109,12 +109,12 @@ def test_advantages_are_those_of_a_loop(env_config):
     torch.testing.assert_close(
         rollouts["agents", "value_target"].squeeze(-1), expected + value.squeeze(-1), rtol=1e-4, atol=1e-5
     )
-    flown = rollouts["agents", "controlled"]
-    normalised = (expected - expected[flown].mean()) / expected[flown].std()
+    controlled = rollouts["agents", "controlled"]
+    normalised = (expected - expected[controlled].mean()) / expected[controlled].std()
     torch.testing.assert_close(rollouts["agents", "advantage"].squeeze(-1), normalised, rtol=1e-3, atol=1e-4)
 
 
-def test_judging_leaves_the_flights_as_they_were_flown():
+def test_computing_advantages_leaves_the_rollouts_unchanged():
     learner = _learner()
     rollouts = _collector(learner).collect()
     before = rollouts.clone()
@@ -132,7 +132,7 @@ def _losses(learner, rollouts, receivers, kl_coef):
     return learner.loss(batch)
 
 
-def test_losses_are_those_of_torch_distributions():
+def test_losses_equal_those_of_torch_distributions():
     learner = _learner("modgnn_mlp", noise=0.4, entropy_coef=0.01)
     rollouts = _collector(learner).collect()
     with torch.no_grad():
@@ -160,18 +160,18 @@ def test_losses_are_those_of_torch_distributions():
 
 
 @pytest.mark.parametrize(("name", "model"), [("pair_force", {}), ("mpnn", {"layers": 2})])
-def test_the_leader_and_the_burn_in_reach_no_gradient(name, model):
+def test_the_leader_and_the_burn_in_do_not_affect_gradients(name, model):
     """Whatever advantages and targets they have, the weights after an update are the same."""
     weights = []
-    for rubbish in (0.0, 1e3):
+    for garbage in (0.0, 1e3):
         learner = _learner(name, model=model)
         rollouts = _collector(learner).collect()
         compute_advantages = learner.compute_advantages
 
-        def spoiled(rollouts, compute_advantages=compute_advantages, rubbish=rubbish):
+        def spoiled(rollouts, compute_advantages=compute_advantages, garbage=garbage):
             compute_advantages(rollouts)
             for key in ("advantage", "action_log_prob"):
-                rollouts["agents", key][:, :, 0] += rubbish
+                rollouts["agents", key][:, :, 0] += garbage
 
         learner.compute_advantages = spoiled
         learner.update(rollouts, kl_coef=0.1)
@@ -180,7 +180,7 @@ def test_the_leader_and_the_burn_in_reach_no_gradient(name, model):
     assert torch.equal(weights[0][1], weights[1][1])
 
 
-def test_steps_of_the_burn_in_are_not_chosen():
+def test_steps_of_the_burn_in_do_not_count():
     learner = _learner("mpnn", model={"layers": 2})
     seen = []
     forward = learner.loss.forward
@@ -215,14 +215,14 @@ def test_a_large_kl_penalty_keeps_the_policy_near_the_reference_policy():
     assert moved[1] < 0.3 * moved[0]
 
 
-def test_the_losses_of_a_critic_fall():
+def test_the_loss_of_the_critic_falls():
     learner = _learner(critic_learning_rate=1e-2, epochs=4)
     rollouts = _collector(learner).collect()
     losses = [learner.update(rollouts.clone(), critic_only=True)["loss_critic"] for _ in range(6)]
     assert losses[-1] < 0.5 * losses[0]
 
 
-def test_updates_move_policy_sigma_and_average():
+def test_updates_change_policy_sigma_and_average():
     learner = _learner(ema_decay=0.5)
     before = {name: value.clone() for name, value in learner.actor.state_dict().items()}
     learner.update(_collector(learner).collect())
