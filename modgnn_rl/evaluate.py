@@ -18,11 +18,11 @@ def main(config: EvaluateConfig) -> None:
         python -m modgnn_rl.evaluate 'run=runs/<date>-<name>' 'evaluation.num_agents=[8,16,64]'
         python -m modgnn_rl.evaluate 'run=runs/<date>-<name>' env.physics=bullet env.message_loss=0.2
     """
-    RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
+    run = RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
     from modgnn_rl.experiment.evaluate import evaluate_run
 
-    file = evaluate_run(config)
-    print(f"The table is in {file.with_suffix('.md')}, all figures in {file}")
+    file = evaluate_run(config, run)
+    print(f"The table is in {file.with_suffix('.md')}, all values in {file}")
     runs = shlex.quote(f"runs={file.absolute().parent.parent}")
     print(f"Next, beside other runs: python -m modgnn_rl.runs {runs} sort=evaluation")
 

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from modgnn_rl.deploy.export import Exported
     from modgnn_rl.nn.modgnn import ModGNN
 
-NEIGHBOURS = 10  # whose messages come in while the latency is measured
-REPEATS = 300
+NEIGHBOURS = 10  # whose messages are received while the latency is measured
+REPEATS = 300  # steps that are timed
 
 
 def main(config: ExportConfig) -> None:
@@ -27,18 +27,18 @@ def main(config: ExportConfig) -> None:
         python -m modgnn_rl.export 'run=runs/<date>-<name>'
         python -m modgnn_rl.export 'run=runs/<date>-<name>' output=robot
     """
-    RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
+    run = RunFolder.open(config.run)  # before the heavy imports: a typing error must be reported at once
     from modgnn_rl.experiment.export import export_run
 
-    print(report(*export_run(config)))
+    print(report(*export_run(config, run)))
 
 
 def report(exported: Exported, policy: ModGNN) -> str:
-    """Sizes, largest difference and latency of an exported agent that reads its observation alone, and how to fly it.
+    """Describe an exported agent: size, difference from the policy, latency, and how to run it on a robot.
 
     Args:
-        exported: what `modgnn_rl.deploy.export.export_agent` made.
-        policy: of this policy.
+        exported: what `modgnn_rl.deploy.export.export_agent` returned.
+        policy: the policy it was exported from.
     """
     import torch
 
@@ -61,17 +61,17 @@ def report(exported: Exported, policy: ModGNN) -> str:
         *(f"  {file.name:<14}{file.stat().st_size / 1000:7.1f} kB" for file in files),
         f"Largest difference from the policy: {exported.difference:.1e}, at most {TOLERANCE[dtype]:.0e}",
         f"One step with {NEIGHBOURS} neighbours, median: onnxruntime {onnx:.0f} us, torch {eager:.0f} us",
-        "A robot needs that folder, numpy and onnxruntime. There it flies"
-        + (f", {frequency:g} times a second, by" if frequency else " by"),
+        "A robot needs that folder, numpy and onnxruntime. It calls"
+        + (f", {frequency:g} times a second," if frequency else ""),
         "  agent = onnx_agent.OnnxAgent('.')",
         "  message = agent.observe(observation); agent.receive(messages_of_neighbours); action = agent.act()",
-        f"Next, alone in the world: cd {shlex.quote(str(exported.folder))} && python -c {shlex.quote(alone)}",
+        f"Next, try it without neighbours: cd {shlex.quote(str(exported.folder))} && python -c {shlex.quote(alone)}",
     ]
     return "\n".join(lines)
 
 
 def latency(agent: Any, observation: Any, messages: Any) -> float:
-    """Median time of a whole step of an agent, microseconds."""
+    """Median time of one step of an agent, microseconds."""
     times = []
     for _ in range(REPEATS):
         start = time.perf_counter()

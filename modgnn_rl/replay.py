@@ -24,23 +24,23 @@ def main(config: ReplayConfig) -> None:
         python -m modgnn_rl.replay 'run=runs/<date>-<name>' num_agents=64 env.message_loss=0.3
         python -m modgnn_rl.replay 'run=runs/<date>-<name>' format=svg step=400
     """
-    refuse(config)
+    check_request(config)
     from modgnn_rl.experiment.replay import replay_run
 
     path = replay_run(config)
-    what = {"html": "rollout", "mp4": "film"}.get(config.format, "picture")
+    what = {"html": "replay", "mp4": "video"}.get(config.format, "image")
     print(f"The {what} is in {path}")
     if config.format == "html":
         print(f"Next: python -m webbrowser {path.as_uri()}")
     else:
-        print(f"Next, a page that plays it: python -m modgnn_rl.replay {shlex.quote(f'run={config.run}')}")
+        print(f"Next, an interactive page: python -m modgnn_rl.replay {shlex.quote(f'run={config.run}')}")
 
 
-def refuse(config: ReplayConfig) -> None:
-    """Find what cannot be done before the heavy imports.
+def check_request(config: ReplayConfig) -> None:
+    """Check the settings before the heavy imports.
 
     Raises:
-        InputError: a folder that is not there, settings that do not go together, or a package that is not installed.
+        InputError: not a run folder, settings that contradict each other, or a package that is not installed.
     """
     for folder in (config.run, *as_list(config.others or [])):
         RunFolder.open(folder)
@@ -48,13 +48,13 @@ def refuse(config: ReplayConfig) -> None:
         if Path(config.output).suffix.lower() != f".{config.format}":
             raise InputError(f"output={config.output} must be a file whose name ends in .{config.format}")
         if not Path(config.output).absolute().parent.is_dir():
-            raise InputError(f"output={config.output} lies in a folder that does not exist; make it first")
+            raise InputError(f"output={config.output} is in a folder that does not exist; create the folder first")
     if config.step is not None and config.format not in ("svg", "png"):
-        raise InputError(f"step={config.step} is the step of a picture; give format=svg or format=png, or leave it out")
+        raise InputError(f"step={config.step} is the step of an image; set format=svg or format=png, or leave step out")
     if config.step is not None and config.step >= config.steps:
-        raise InputError(f"step={config.step} is not flown: there are steps={config.steps}, counted from 0")
+        raise InputError(f"step={config.step} is beyond the rollout of steps={config.steps}, which are counted from 0")
     if config.format == "mp4" and (config.others or config.viewer):
-        raise InputError("a film shows one policy; leave out others and viewer, or use format=html")
+        raise InputError("a video shows one policy; leave out others and viewer, or use format=html")
     if missing := [name for name in PACKAGES[config.format] if importlib.util.find_spec(name) is None]:
         extra = EXTRAS[config.format]
         raise InputError(

@@ -1,4 +1,4 @@
-"""Evaluate the policies of a run: roll out, summarise, and write table and replay into the run folder."""
+"""Evaluate the policies of a run: roll out, summarise, and write tables and replays into the run folder."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from modgnn_rl.envs.flocking.recording import FlockRecorder
 from modgnn_rl.evaluation.rollout import evaluate
 from modgnn_rl.evaluation.table import evaluation_markdown, read_tables, summarise_rollouts
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.tracking.loading import load_policy, override_env_config
+from modgnn_rl.tracking.loading import load_env_config, load_policy, override_env_config
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.visualization.html import write_replay
 from modgnn_rl.visualization.recording import recording_stride
 
-__all__ = ["REPLAY_FRAMES", "evaluate_policies", "evaluate_run", "evaluation_file"]
+__all__ = ["evaluate_policies", "evaluate_run", "evaluation_file"]
 
-REPLAY_FRAMES = 250  # of the replay beside a table: keeping more would take longer than a second
+MAX_REPLAY_FRAMES = 250  # writing more would take longer than a second
 
 
 def evaluate_policies(
@@ -31,23 +31,29 @@ def evaluate_policies(
     policies: Mapping[str, ModGNN],
     env_config: FlockingConfig,
     settings: EvaluationConfig,
-    sizes: list[int],
     device: str,
+    *,
     changes: str = "",
     expert: TensorDictModuleBase | None = None,
 ) -> dict[int, dict[str, Any]]:
-    """Fly a run's policies and the reference policies, and write the table of each size into the run folder.
+    """Evaluate a run's policies beside the reference policies, and write tables and replays into the run folder.
 
-    Beside it goes a replay of the first flock, flown by the policies and by the expert. Tables of other sizes that the
-    folder holds already are kept; a world changed since training has files of its own.
+    Args:
+        run: the run folder.
+        policies: by name.
+        env_config: environment config; the numbers of agents are its, unless the settings have their own.
+        settings: of the evaluation.
+        device: of the rollouts.
+        changes: differences from the run's own environment as ``name=value``, separated by commas; they name the files.
+        expert: the policy's teacher; default: Reynolds flocking.
 
     Returns:
-        for each number of agents, the table that `modgnn_rl.evaluation.table.summarise_rollouts` makes.
+        for each number of agents, what `modgnn_rl.evaluation.table.summarise_rollouts` returns.
     """
-    tables, replays = {}, {}
-    for size in sizes:
-        stride = recording_stride(size, settings.steps, REPLAY_FRAMES)
-        replays[size] = {name: FlockRecorder(env_config, stride) for name in (*policies, "expert")}
+    tables, recorders = {}, {}
+    for size in as_list(settings.num_agents or env_config.num_agents):
+        stride = recording_stride(size, settings.steps, MAX_REPLAY_FRAMES)
+        recorders[size] = {name: FlockRecorder(env_config, stride) for name in (*policies, "expert")}
         rollouts = evaluate(
             policies,
             env_config,
@@ -57,53 +63,74 @@ def evaluate_policies(
             seed=settings.seed,
             device=device,
             expert=expert,
-            watches=replays[size],
+            watches=recorders[size],
         )
         tables[size] = summarise_rollouts(rollouts, settings.seed)
-    flown = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
-    new = {str(size): {**flown, "rows": table} for size, table in tables.items()}
-    title = f"{run.path.name} in a world with {changes}" if changes else run.path.name
+    title = f"{run.path.name} with {changes}" if changes else run.path.name
     file = evaluation_file(run, changes)
-    entries = sorted({**read_tables(file), **new}.items(), key=lambda entry: int(entry[0]))
-    run.write(file.name, json.dumps(dict(entries), indent=2) + "\n")
-    run.write(file.with_suffix(".md").name, evaluation_markdown(dict(entries), title))
-    print(f"\n{evaluation_markdown(new, title)}", flush=True)
-    for size, recorders in replays.items():
-        page = file.with_name(file.stem.replace("evaluation", f"replay-{size}", 1) + ".html")
-        recordings = {name: recorder.recording() for name, recorder in recorders.items()}
-        write_replay(page, recordings, title, {"seed": settings.seed, "flock": f"1 of {settings.num_flocks}"})
-        print(f"A rollout of {size} agents to watch in a browser: {page}", flush=True)
+    print(f"\n{_write_tables(run, file, tables, settings, title)}", flush=True)
+    for size, page in _write_replays(file, recorders, settings, title).items():
+        print(f"Replay of {size} agents, for a browser: {page}", flush=True)
     return tables
 
 
+def _write_tables(run: RunFolder, file: Path, tables: Mapping[int, Any], settings: EvaluationConfig, title: str) -> str:
+    """Add tables to a file of JSON and the Markdown page beside it, which may have some of other sizes.
+
+    Returns:
+        the new tables as Markdown.
+    """
+    about = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
+    new = {str(size): {**about, "rows": table} for size, table in tables.items()}
+    entries = dict(sorted({**read_tables(file), **new}.items(), key=lambda entry: int(entry[0])))
+    run.write(file.name, json.dumps(entries, indent=2) + "\n")
+    run.write(file.with_suffix(".md").name, evaluation_markdown(entries, title))
+    return evaluation_markdown(new, title)
+
+
+def _write_replays(
+    file: Path, recorders: Mapping[int, Mapping[str, FlockRecorder]], settings: EvaluationConfig, title: str
+) -> dict[int, Path]:
+    """Write a replay of the first flock for each number of agents, beside the file of the tables."""
+    pages = {}
+    for size, by_policy in recorders.items():
+        pages[size] = file.with_name(file.stem.replace("evaluation", f"replay-{size}", 1) + ".html")
+        recordings = {name: recorder.recording() for name, recorder in by_policy.items()}
+        write_replay(pages[size], recordings, title, {"seed": settings.seed, "flock": f"1 of {settings.num_flocks}"})
+    return pages
+
+
 def evaluation_file(run: RunFolder, changes: str = "") -> Path:
-    """Where the figures of an evaluation are, in the world of training or in a changed one; the table is beside them.
+    """The JSON file of an evaluation; its Markdown page is beside it.
 
     Args:
         run: the run folder.
-        changes: ``name=value`` of all that was changed, separated by commas.
+        changes: differences from the run's own environment as ``name=value``, separated by commas.
     """
     return run.path / (f"evaluation-{changes.replace('/', '_')}.json" if changes else "evaluation.json")
 
 
-def evaluate_run(config: EvaluateConfig) -> Path:
-    """Evaluate the policy of a run, in the world that it was trained in or in another.
+def evaluate_run(config: EvaluateConfig, run: RunFolder | None = None) -> Path:
+    """Evaluate the policy of a run, in the environment of its training or in a changed one.
+
+    Args:
+        config: the settings.
+        run: the folder that ``config.run`` names, if it is open already.
 
     Returns:
-        the file of figures.
+        the JSON file of the evaluation.
 
     Raises:
         InputError: a bad setting, no such run, no readable policy in it, or no such device.
     """
     check(config)
     prepare_torch(config.device, config.threads)
-    policy = load_policy(config.run, device=config.device, which=config.checkpoint)
-    run = RunFolder.open(config.run)
-    env_config, changes = override_env_config(run, config.env)
-    sizes = as_list(config.evaluation.num_agents or env_config.num_agents)
+    run = run or RunFolder.open(config.run)
+    trained_in = load_env_config(run)
+    policy = load_policy(run, device=config.device, which=config.checkpoint, env_config=trained_in)
+    env_config, changed = override_env_config(trained_in, config.env)
     best = {"checkpoint": "best"} if config.checkpoint == "best" else {}
-    named = ",".join(f"{name}={value}" for name, value in sorted({**changes, **best}.items()))
-    evaluate_policies(
-        run, {run.config["model"]["name"]: policy}, env_config, config.evaluation, sizes, config.device, named
-    )
-    return evaluation_file(run, named)
+    changes = ",".join(f"{name}={value}" for name, value in sorted({**changed, **best}.items()))
+    policies = {run.config["model"]["name"]: policy}
+    evaluate_policies(run, policies, env_config, config.evaluation, config.device, changes=changes)
+    return evaluation_file(run, changes)

@@ -16,20 +16,25 @@ from modgnn_rl.utils.device import prepare_torch
 __all__ = ["export_run"]
 
 
-def export_run(config: ExportConfig) -> tuple[Exported, ModGNN]:
+def export_run(config: ExportConfig, run: RunFolder | None = None) -> tuple[Exported, ModGNN]:
     """Export the policy of a run.
 
+    Args:
+        config: the settings.
+        run: the folder that ``config.run`` names, if it is open already.
+
     Returns:
-        what was made, and the policy.
+        the exported agent, and the policy.
 
     Raises:
-        InputError: a bad setting, no such run, no readable policy in it, or for what `export_agent` raises it.
+        InputError: a bad setting, no such run, no readable policy in it, or as `export_agent`.
     """
     check(config)
     check_packages()
     prepare_torch("cpu", config.threads)
-    policy, run = load_policy(config.run), RunFolder.open(config.run)
+    run = run or RunFolder.open(config.run)
     env_config = load_env_config(run)
+    policy = load_policy(run, env_config=env_config)
     spec = FlockingEnv(1, 2, config=env_config).observation_spec["agents", "observation"]
     exported = export_agent(
         policy,

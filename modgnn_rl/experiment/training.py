@@ -13,7 +13,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
-from modgnn_rl.configs.schema import TrainConfig, as_list
+from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.envs.flocking.task import training_env_factory
@@ -193,8 +193,7 @@ def _evaluate(
 ) -> None:
     """Evaluate the policies, and show the tables on dashboards."""
     run.note_status("evaluating")
-    sizes = as_list(config.evaluation.num_agents or config.env.num_agents)
-    tables = evaluate_policies(run, policies, config.env, config.evaluation, sizes, device, expert=expert)
+    tables = evaluate_policies(run, policies, config.env, config.evaluation, device, expert=expert)
     log_evaluation(loggers, tables)
 
 

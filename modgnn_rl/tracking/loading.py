@@ -1,9 +1,8 @@
-"""Policies from run folders."""
+"""Policies and settings of run folders."""
 
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,23 +20,30 @@ from modgnn_rl.tracking.run_folder import RunFolder
 __all__ = ["load_env_config", "load_policy", "override_env_config", "stored_model"]
 
 
-def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", which: str = "last") -> ModGNN:
-    """Load the policy that a run ended with, or reached so far.
+def load_policy(
+    run: RunFolder | str | os.PathLike[str],
+    *,
+    device: torch.device | str = "cpu",
+    which: str = "last",
+    env_config: FlockingConfig | None = None,
+) -> ModGNN:
+    """Load the policy of a run.
 
     Args:
-        folder: a run folder, ``runs/<date>-<name>``.
-        device: where the policy goes.
-        which: ``last``, or ``best``: the one with the best score while it trained.
+        run: a run folder, or its path ``runs/<date>-<name>``.
+        device: device of the policy.
+        which: ``last``: the latest; or ``best``: the one with the best score in training.
+        env_config: environment config of the run, if it is loaded already.
 
     Returns:
         the policy, a TensorDictModule for flocks of any size, in evaluation mode.
 
     Raises:
-        InputError: the folder holds no run, no readable checkpoint, or one of another model.
+        InputError: not a run folder, no readable checkpoint, or a checkpoint of another model.
     """
-    run = RunFolder.open(Path(folder))
+    run = run if isinstance(run, RunFolder) else RunFolder.open(run)
     model = stored_model(run)
-    policy = configured_model(model, load_env_config(run), seed=0)
+    policy = configured_model(model, env_config or load_env_config(run), seed=0)
     checkpoint = load_checkpoint(run.best if which == "best" else run.checkpoints, groups=("policy",))
     try:
         policy.load_state_dict(checkpoint.tensors["policy"])
@@ -50,44 +56,44 @@ def load_policy(folder: str | os.PathLike[str], *, device: torch.device | str = 
 
 
 def stored_model(run: RunFolder) -> ModelConfig:
-    """The model that a run trained.
+    """The model settings of a run.
 
     Raises:
-        InputError: its configuration does not describe one.
+        InputError: its configuration is damaged.
     """
     model: ModelConfig = _stored(run, "model", ModelConfig)
     return model
 
 
 def load_env_config(run: RunFolder) -> FlockingConfig:
-    """The world that a run was trained in.
+    """The environment config of a run.
 
     Raises:
-        InputError: its configuration does not describe one.
+        InputError: its configuration is damaged.
     """
     env_config: FlockingConfig = _stored(run, "env", FlockingConfig)
     return env_config
 
 
-def override_env_config(run: RunFolder, changes: Any) -> tuple[FlockingConfig, dict[str, Any]]:
-    """The world that a run was trained in, with some settings changed.
+def override_env_config(env_config: FlockingConfig, overrides: Any) -> tuple[FlockingConfig, dict[str, Any]]:
+    """Change some settings of an environment.
 
     Args:
-        run: the run.
-        changes: a `modgnn_rl.configs.schema.EnvOverrides`.
+        env_config: environment config, such as that of a run.
+        overrides: a `modgnn_rl.configs.schema.EnvOverrides`; its settings that are None stay as they are.
 
     Returns:
-        the world, and by name the settings that are changed.
+        the changed environment config, and by name the settings that it changes.
 
     Raises:
         InputError: a value of the wrong kind.
     """
-    changed = {name: value for name, value in vars(changes).items() if value is not None}
+    changed = {name: value for name, value in vars(overrides).items() if value is not None}
     try:
-        env_config: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(load_env_config(run)), changed))
+        found: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(env_config), changed))
     except OmegaConfBaseException as error:
         raise InputError(f"env.{error.full_key}: {str(error.msg).splitlines()[0]}") from error
-    return env_config, changed
+    return found, changed
 
 
 def _stored(run: RunFolder, group: str, schema: type) -> Any:

@@ -115,7 +115,7 @@ def test_evaluation_in_another_environment_has_its_own_files(run):
     )
     file = evaluate_run(config)
     assert file.name == "evaluation-message_loss=0.5,physics=bullet.json"
-    assert "in a world with message_loss=0.5,physics=bullet" in file.with_suffix(".md").read_text()
+    assert "with message_loss=0.5,physics=bullet" in file.with_suffix(".md").read_text()
     assert json.loads(file.read_text())["5"]["num_flocks"] == 2
     assert (run.path / "evaluation.json").read_text() == before
     with pytest.raises(InputError, match=r"env\.max_links"):

@@ -18,7 +18,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.recording import record
 from modgnn_rl.evaluation.rollout import reference_policies, rollout
 from modgnn_rl.nn.topology import as_matrix
-from modgnn_rl.replay import refuse
+from modgnn_rl.replay import check_request
 from modgnn_rl.visualization import html
 from modgnn_rl.visualization.recording import QUANTUM, MetricSeries, Recording, recording_stride
 
@@ -153,12 +153,12 @@ def test_invalid_settings_are_one_sentence(tmp_path):
         (ReplayConfig(run=run, output=str(tmp_path / "no" / "a.html")), "folder that does not exist"),
         (ReplayConfig(run=run, output=str(tmp_path)), r"a file whose name ends in \.html"),
         (ReplayConfig(run=run, format="svg", output="a.png"), r"a file whose name ends in \.svg"),
-        (ReplayConfig(run=run, step=5), "step=5 is the step of a picture"),
-        (ReplayConfig(run=run, format="svg", step=1000), "step=1000 is not flown"),
-        (ReplayConfig(run=run, format="mp4", viewer=True), "a film shows one policy"),
+        (ReplayConfig(run=run, step=5), "step=5 is the step of an image"),
+        (ReplayConfig(run=run, format="svg", step=1000), "step=1000 is beyond the rollout"),
+        (ReplayConfig(run=run, format="mp4", viewer=True), "a video shows one policy"),
     ):
         with pytest.raises(InputError, match=words) as error:
-            refuse(config)
+            check_request(config)
         assert "\n" not in str(error.value)
 
 
