@@ -1,4 +1,4 @@
-"""Building blocks that several models share: scaling, heads, multilayer perceptrons."""
+"""Building blocks that several models share: scaling, action head, multilayer perceptron."""
 
 from __future__ import annotations
 
@@ -25,22 +25,20 @@ __all__ = [
 ]
 
 POSITION_SCALE = 0.5  # 1/m
-
 VELOCITY_SCALE = 1.4  # s/m
-LATENT = 10  # width of f_pre's and f_mid's outputs in the paper
-
-FEATURES = 16  # width of what layers before the last put out
+LATENT = 10  # output width of f_pre and f_mid in the paper
+FEATURES = 16  # output width of layers before the last
 
 
 class LayerSpec(NamedTuple):
-    """What a model is asked to build.
+    """The layer that a model is to build.
 
     Attributes:
         hops: communication hops K.
         hidden: width of the hidden layers.
         earlier: number of earlier layers.
-        head: what the last layer ends in; None for the layers before it.
-        num_agents: N, for a model that needs to know.
+        head: final module of the last layer; None for the layers before it.
+        num_agents: N, for models that depend on it.
     """
 
     hops: int
@@ -51,7 +49,7 @@ class LayerSpec(NamedTuple):
 
     @property
     def inputs(self) -> int:
-        """Width of the layer's input: observation, and outputs of earlier layers."""
+        """Width of the layer's input: observation and outputs of earlier layers."""
         return 6 + self.earlier * FEATURES
 
     @property
@@ -60,16 +58,20 @@ class LayerSpec(NamedTuple):
         return FEATURES if self.head is None else 3
 
     def end(self, *f_final: nn.Module) -> nn.Module:
-        """F_final of the layer: the given modules, then the head in the last layer."""
+        """The layer's f_final: the given modules, followed by the head in the last layer."""
         return nn.Sequential(*f_final) if self.head is None else nn.Sequential(*f_final, self.head)
 
     def scales(self) -> list[nn.Module]:
-        """Scaling for every hop, which hides the absolute position from hop 0."""
+        """One scaling module per hop; the one of hop 0 hides the absolute position."""
         return [Scale(self.inputs, hide_position=hop == 0) for hop in range(self.hops + 1)]
 
 
 class BallHead(nn.Module):
-    """Projection onto the ball of allowed actions: what the environment and the expert do to theirs."""
+    """Projection onto the ball of allowed actions, as in the environment and the expert.
+
+    Args:
+        max_speed: radius of the ball, m/s.
+    """
 
     is_equivariant = True
 
@@ -83,11 +85,11 @@ class BallHead(nn.Module):
 
 
 class Scale(nn.Module):
-    """Bring positions and velocities to order one, and hide the position where it is absolute.
+    """Scale positions and velocities to order one; optionally hide the position.
 
     Args:
-        features: width of the data; what follows position and velocity stays as it is.
-        hide_position: return zero positions, for data that are no differences.
+        features: width of the data; columns after position and velocity are not changed.
+        hide_position: return zero positions, for data that contain absolute positions.
     """
 
     is_linear_map = True
@@ -100,12 +102,12 @@ class Scale(nn.Module):
         self.register_buffer("factor", factor, persistent=False)
 
     def forward(self, data: Tensor) -> Tensor:
-        """Scale position, velocity and what follows [..., F]."""
+        """Scale data [..., F]."""
         return data * self.factor
 
 
 class Relative(nn.Module):
-    """From the two ends of a link, side by side, to what does not feel a translation: difference, and receiver.
+    """Translation-invariant features of an edge: the difference of its ends, and the receiver without its position.
 
     Args:
         features: width of one end F, which begins with position and velocity.
@@ -122,7 +124,11 @@ class Relative(nn.Module):
 
 
 class Zero(nn.Module):
-    """A hop that contributes nothing: zeros of a given width."""
+    """A hop that contributes nothing.
+
+    Args:
+        features: width of the output.
+    """
 
     is_equivariant = True
 
@@ -138,11 +144,11 @@ class Zero(nn.Module):
 def is_equivariant(module: nn.Module) -> bool:
     """Whether a policy is known to be rotation-equivariant: each part is in a module with ``is_equivariant = True``."""
     parts = [part for part in module.modules() if not list(part.children())]
-    inside = {part for holder in module.modules() if _says_so(holder) for part in holder.modules()}
+    inside = {part for holder in module.modules() if _is_marked(holder) for part in holder.modules()}
     return all(part in inside or isinstance(part, (nn.Identity, GraphShift)) for part in parts)
 
 
-def _says_so(module: nn.Module) -> bool:
+def _is_marked(module: nn.Module) -> bool:
     return bool(getattr(module, "is_equivariant", False))
 
 

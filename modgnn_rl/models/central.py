@@ -1,4 +1,4 @@
-"""The paper's centralised baseline, as a layer of `modgnn_rl.ModGNN` that needs no messages."""
+"""The paper's centralised baseline, as a layer of `modgnn_rl.ModGNN` without messages."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ __all__ = ["CentralLayer"]
 
 
 class CentralLayer(nn.Module):
-    """A network that reads all agents at once and acts for all: no graph, no delay, one number of agents.
+    """A network from all agents' observations to all actions: no graph, no delay, a fixed number of agents.
 
-    Positions are taken relative to the mean of the agents, so that it does not matter where the flock is; agents that
-    do not exist, or that see anything that is not finite, are zeros. It is not equivariant to permutations.
+    Positions are relative to the mean position, which makes it invariant to translations. Agents that do not exist, or
+    whose observation contains NaN or infinity, are zeros. It is not equivariant to permutations.
 
     Args:
         num_agents: N.
-        features: first three columns of an observation are the position.
+        features: width of an observation, whose first three columns are the position.
         hidden: width of the three hidden layers.
         outputs: width of an agent's output.
-        scale: multiplies the centred observation, a module [*, F] -> [*, F].
+        scale: applied to the centred observation, a module [*, F] -> [*, F].
         head: applied to each agent's output.
     """
 
@@ -58,32 +58,32 @@ class CentralLayer(nn.Module):
         receivers: Tensor | None = None,
         record: Recorder | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Run a window; the arguments are those of `ModGNNLayer.forward`, of which only the first is looked at.
+        """Run a window; the arguments are those of `ModGNNLayer.forward`, of which it ignores the graph and messages.
 
         Returns:
             outputs [*B, T, N, O], and no messages [*B, T, N, 0, F].
 
         Raises:
-            InputError: for another number of agents than the network was made for.
+            InputError: the number of agents is not ``num_agents``.
         """
         shape = observation.shape[:-1]
         if shape[-1] != self.num_agents:
             raise InputError(
-                f"a central model made for {self.num_agents} agents was given {shape[-1]}; it reads all of them at "
-                "once and serves one number only: train another, or take a model that shares its weights over agents"
+                f"a central model for {self.num_agents} agents was given {shape[-1]}; it works for one number only: "
+                "train another, or use a model that shares its weights between agents"
             )
         topology = adjacency if isinstance(adjacency, Topology) else Topology(adjacency, shape[-1], receivers=receivers)
-        seen, _, sees = mask_invalid(observation.reshape(shape.numel(), -1), {})
-        there = sees if topology.exists is None else sees & topology.exists
-        flocks = mask_rows(seen, there).unflatten(0, (-1, self.num_agents))
-        counts = there.view(-1, self.num_agents, 1).sum(1, keepdim=True).clamp(min=1)
+        inputs, _, valid = mask_invalid(observation.reshape(shape.numel(), -1), {})
+        present = valid if topology.exists is None else valid & topology.exists
+        flocks = mask_rows(inputs, present).unflatten(0, (-1, self.num_agents))
+        counts = present.view(-1, self.num_agents, 1).sum(1, keepdim=True).clamp(min=1)
         mean = flocks[..., :3].sum(1, keepdim=True) / counts
         centred = torch.cat((flocks[..., :3] - mean, flocks[..., 3:]), -1).flatten(0, 1)
-        inputs = mask_rows(self.scale(centred), there).view(-1, self.num_agents * centred.shape[-1])
-        output = self.head(self.network(inputs).view(shape.numel(), self.outputs))
-        output = mask_rows(output, sees, torch.nan)
+        features = mask_rows(self.scale(centred), present).view(-1, self.num_agents * centred.shape[-1])
+        output = self.head(self.network(features).view(shape.numel(), self.outputs))
+        output = mask_rows(output, valid, torch.nan)
         if topology.targets is not None:
             output = mask_rows(output, topology.targets)
         if record is not None and record.wants("f_final"):
             record.record_nodes("f_final", None, output)
-        return output.unflatten(0, shape), seen.new_zeros(*shape, 0, seen.shape[-1])
+        return output.unflatten(0, shape), inputs.new_zeros(*shape, 0, inputs.shape[-1])

@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 SOFTENING = 1e-8
-MANY = 8.0  # sums over about this many neighbours are brought to order one
+TYPICAL_DEGREE = 8.0  # sums over about this many neighbours are scaled to order one
 
 
 class PairForce(nn.Module):
@@ -36,15 +36,15 @@ class PairForce(nn.Module):
     small network maps the invariants to (a, b, c), and the force is ``a u + b w + c v``. Forces are summed over the
     neighbours, so that a policy trained at one flock size works at others.
 
-    Behind earlier layers, which put out C vectors and S scalars each, these are compared and combined in the same way:
-    their differences, and the receiver's own.
+    The C vectors and S scalars that each earlier layer outputs are used in the same way: their differences, and the
+    receiver's own.
 
     Args:
         hidden: width of the network's two hidden layers.
-        vectors: vectors that the layer puts out.
-        scalars: scalars that the layer puts out, behind the vectors.
+        vectors: number of output vectors.
+        scalars: number of output scalars, after the vectors.
         earlier: number of earlier layers.
-        features: (C, S), what each earlier layer puts out.
+        features: (C, S), numbers of vectors and scalars that each earlier layer outputs.
     """
 
     is_equivariant = True
@@ -64,7 +64,7 @@ class PairForce(nn.Module):
         self.network = mlp(7 + 4 * further + numbers, hidden, vectors * (3 + further) + scalars)
 
     def forward(self, relative: Tensor, own: Tensor) -> Tensor:
-        """Forces of links.
+        """Forces of edges.
 
         Args:
             relative: sender minus receiver, one step old: position, m, velocity, m/s, outputs of earlier layers [E, F].
@@ -73,7 +73,7 @@ class PairForce(nn.Module):
         Returns:
             vectors (one: the force, m/s), then scalars [E, 3 V + S].
         """
-        # Components first: sums over three numbers in a row are several times slower.
+        # Components first: sums over a last dimension of three are several times slower.
         ends = [data.movedim(-1, 0).contiguous() for data in (relative, own)]
         offset, drift, velocity = ends[0][:3], ends[0][3:6], ends[1][3:6]
         distance, drift_speed, own_speed = _norm(offset), _norm(drift), _norm(velocity)
@@ -107,20 +107,20 @@ class PairForce(nn.Module):
         return torch.cat(results).movedim(0, -1)
 
     def _of_earlier_layers(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Vectors [L C, 3, E] and scalars [L S, E] in what L earlier layers put out [L (3 C + S), E]."""
+        """Vectors [L C, 3, E] and scalars [L S, E] in the outputs of L earlier layers [L (3 C + S), E]."""
         count = self.features[0]
         blocks = outputs.unflatten(0, (self.earlier, -1))
         return blocks[:, : 3 * count].unflatten(1, (count, 3)).flatten(0, 1), blocks[:, 3 * count :].flatten(0, 1)
 
 
 class Moments(nn.Module):
-    r"""What a neighbourhood looks like from its middle, without anything to learn: an f_pre that is summed.
+    r"""Moments of the neighbours' distribution, an f_pre without parameters.
 
     With relative position r u and relative velocity w of each neighbour, five vectors, ``r u``, ``r^2 u``,
-    ``u / (r + 0.3)``, ``w`` and ``r^4 u``, and three scalars, ``1``, ``r`` and ``1 / (r + 0.3)``, brought to order one.
-    The powers of r tell the far from the near: the fourth points to whoever is farthest.
+    ``u / (r + 0.3)``, ``w`` and ``r^4 u``, and three scalars, ``1``, ``r`` and ``1 / (r + 0.3)``, scaled to order one.
+    The powers of r distinguish near from far neighbours: the fourth is dominated by the farthest.
 
-    Behind earlier layers, what these put out is summed, in the same form.
+    After earlier layers, their outputs are summed, in the same form.
 
     Args:
         earlier: number of earlier layers.
@@ -134,29 +134,29 @@ class Moments(nn.Module):
         self.earlier = earlier
 
     def forward(self, relative: Tensor) -> Tensor:
-        """Vectors and scalars of links [E, 18].
+        """Vectors and scalars of edges [E, 18].
 
         Args:
             relative: sender minus receiver, one step old: position, m, velocity, m/s, outputs of earlier layers [E, F].
         """
         if self.earlier:
-            return relative[..., -(3 * self.vectors + self.scalars) :] / MANY
+            return relative[..., -(3 * self.vectors + self.scalars) :] / TYPICAL_DEGREE
         offset, drift = relative[..., :6].movedim(-1, 0).contiguous().split(3)
         distance = _norm(offset)
         nearness = 1 / (distance + 0.3)
         vectors = [
-            offset / MANY,
-            offset * (distance / (2 * MANY)),
-            offset * (2 * nearness / (distance * MANY)),
-            drift * (2 / MANY),
-            offset * (distance**3 / (8 * MANY)),
+            offset / TYPICAL_DEGREE,
+            offset * (distance / (2 * TYPICAL_DEGREE)),
+            offset * (2 * nearness / (distance * TYPICAL_DEGREE)),
+            drift * (2 / TYPICAL_DEGREE),
+            offset * (distance**3 / (8 * TYPICAL_DEGREE)),
         ]
-        scalars = torch.stack([torch.ones_like(distance), distance / 2, nearness]) / MANY
+        scalars = torch.stack([torch.ones_like(distance), distance / 2, nearness]) / TYPICAL_DEGREE
         return torch.cat([*vectors, scalars]).movedim(0, -1)
 
 
 class VectorSquash(nn.Module):
-    """Bring vectors and scalars of any size to order one, equivariantly: ``x / (1 + |x|)`` each.
+    """Scale vectors and scalars of any size to order one, equivariantly: ``x / (1 + |x|)`` each.
 
     Args:
         vectors: number of vectors V; scalars follow them.
@@ -185,14 +185,14 @@ def _norm(vector: Tensor) -> Tensor:
     return (_dot(vector, vector) + SOFTENING).sqrt()
 
 
-VECTORS, SCALARS = 4, 4  # the same of pair_force: 3 * 4 + 4 features
+VECTORS, SCALARS = 4, 4  # outputs of pair_force's layers before the last: 3 * 4 + 4 features
 
 
 @MODELS.register("moment_force", layers=2)
 def moment_force(spec: LayerSpec) -> ModGNNLayer:
-    """`pair_force` over what the neighbours' own neighbourhoods look like: `Moments` in the layers before the last.
+    """`pair_force` that also reads `Moments` of the neighbours' own neighbourhoods, from the layers before the last.
 
-    These have nothing to learn, so that an agent sees two links far and training costs little more than with one.
+    These have no parameters, so that an agent uses data from two hops away at little more training cost than with one.
     """
     features = Moments.vectors, Moments.scalars
     if spec.head is not None:
@@ -203,16 +203,16 @@ def moment_force(spec: LayerSpec) -> ModGNNLayer:
 
 @MODELS.register("pair_force")
 def pair_force(spec: LayerSpec) -> ModGNNLayer:
-    """Equivariant forces of pairs as f_pre, summed over the neighbours: `PairForce`; hop 0 contributes nothing.
+    """Equivariant pairwise forces as f_pre, summed over the neighbours: `PairForce`; hop 0 contributes nothing.
 
-    Layers before the last put out four vectors and four scalars, which later layers compare like velocities.
+    Layers before the last output four vectors and four scalars, which later layers use like velocities.
     """
     vectors, scalars = (VECTORS, SCALARS) if spec.head is None else (1, 0)
     return _sum_of_forces(spec, vectors, scalars, features=(VECTORS, SCALARS))
 
 
 def _sum_of_forces(spec: LayerSpec, vectors: int, scalars: int, features: tuple[int, int]) -> ModGNNLayer:
-    """A layer of `PairForce` in each hop, behind layers that put out ``features``."""
+    """A layer with a `PairForce` in each hop, after layers that output ``features``."""
     f_pre: list[nn.Module] = [Zero(3 * vectors + scalars)]
     for _ in range(spec.hops):
         force = PairForce(spec.hidden, vectors=vectors, scalars=scalars, earlier=spec.earlier, features=features)

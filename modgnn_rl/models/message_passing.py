@@ -13,12 +13,12 @@ from modgnn_rl.registry import MODELS
 
 __all__ = ["HEADS", "gat", "mpnn"]
 
-HEADS = 4  # of attention
+HEADS = 4  # attention heads
 
 
 @MODELS.register("gat")
 def gat(spec: LayerSpec) -> ModGNNLayer:
-    """Attention over the neighbours as f_com (GATv2): to differences in hop 1, to what hop 1 made of them after it."""
+    """Attention over the neighbours as f_com (GATv2): to differences in hop 1, then to the previous hop's output."""
     heads = math.gcd(HEADS, spec.hidden)
     f_com: list[nn.Module] = [
         GraphAttention(spec.hidden if hop > 1 else spec.inputs, spec.hidden, heads, relative=hop == 1)
@@ -39,7 +39,7 @@ def mpnn(spec: LayerSpec) -> ModGNNLayer:
 
 
 def _networks_of_hops(spec: LayerSpec, f_com: list[nn.Module]) -> ModGNNLayer:
-    """A layer whose f_com brings ``hidden`` features, with networks as f_mid and f_final."""
+    """A layer whose f_com outputs ``hidden`` features, with networks as f_mid and f_final."""
     f_pre = [Scale(spec.inputs, hide_position=True), *[None] * spec.hops]
     f_mid = [mlp(spec.inputs if hop == 0 else spec.hidden, spec.hidden, LATENT) for hop in range(spec.hops + 1)]
     f_final = spec.end(mlp(LATENT, spec.hidden, spec.outputs))

@@ -16,7 +16,7 @@ __all__ = ["central", "gcn", "gcn_final", "modgnn_adjacency", "modgnn_mlp", "no_
 
 @MODELS.register("modgnn_mlp")
 def modgnn_mlp(spec: LayerSpec) -> ModGNNLayer:
-    """ModGNN-MLP of the paper: three-layer networks for f_pre, f_mid (10 features out) and f_final, one a hop."""
+    """ModGNN-MLP of the paper: three-layer networks as f_pre and f_mid (10 features) of each hop and as f_final."""
     f_pre = [nn.Sequential(scale, mlp(spec.inputs, spec.hidden, LATENT)) for scale in spec.scales()]
     f_mid = [mlp(LATENT, spec.hidden, LATENT) for _ in f_pre]
     f_final = spec.end(mlp(LATENT, spec.hidden, spec.outputs))
@@ -25,7 +25,7 @@ def modgnn_mlp(spec: LayerSpec) -> ModGNNLayer:
 
 @MODELS.register("modgnn_adjacency")
 def modgnn_adjacency(spec: LayerSpec) -> ModGNNLayer:
-    """ModGNN-MLP whose f_com is the adjacency: sums of the neighbours' data, not of differences, as in a plain GCN."""
+    """ModGNN-MLP with the adjacency as f_com: sums of the neighbours' data, not of differences, as in a plain GCN."""
     layer = modgnn_mlp(spec)
     layer.f_com = nn.ModuleList([Adjacency() for _ in range(spec.hops)])
     return layer
@@ -33,7 +33,7 @@ def modgnn_adjacency(spec: LayerSpec) -> ModGNNLayer:
 
 @MODELS.register("no_pre")
 def no_pre(spec: LayerSpec) -> ModGNNLayer:
-    """ModGNN-MLP without f_pre: the neighbours' data are summed before any network sees them."""
+    """ModGNN-MLP without f_pre: the neighbours' data are summed before any network is applied."""
     f_mid = [mlp(spec.inputs, spec.hidden, LATENT) for _ in range(spec.hops + 1)]
     f_final = spec.end(mlp(LATENT, spec.hidden, spec.outputs))
     return ModGNNLayer(spec.hops, f_pre=spec.scales(), f_mid=f_mid, f_final=f_final)
@@ -41,14 +41,14 @@ def no_pre(spec: LayerSpec) -> ModGNNLayer:
 
 @MODELS.register("no_mid")
 def no_mid(spec: LayerSpec) -> ModGNNLayer:
-    """ModGNN-MLP without f_mid: the hops are summed as they come out of f_pre."""
+    """ModGNN-MLP without f_mid: the outputs of f_pre are summed over neighbours and hops."""
     f_pre = [nn.Sequential(scale, mlp(spec.inputs, spec.hidden, LATENT)) for scale in spec.scales()]
     return ModGNNLayer(spec.hops, f_pre=f_pre, f_final=spec.end(mlp(LATENT, spec.hidden, spec.outputs)))
 
 
 @MODELS.register("gcn")
 def gcn(spec: LayerSpec) -> ModGNNLayer:
-    """A GCN: a matrix for each hop as f_mid, no f_pre, a pointwise f_final (the head); ``hidden`` is not used."""
+    """GCN: one matrix per hop as f_mid, no f_pre, a pointwise f_final (the head); ``hidden`` is not used."""
     f_mid = [nn.Linear(spec.inputs, spec.outputs, bias=hop == 0) for hop in range(spec.hops + 1)]
     f_final = nn.Tanh() if spec.head is None else spec.head
     return ModGNNLayer(spec.hops, f_pre=spec.scales(), f_mid=f_mid, f_final=f_final)
@@ -56,7 +56,7 @@ def gcn(spec: LayerSpec) -> ModGNNLayer:
 
 @MODELS.register("gcn_final")
 def gcn_final(spec: LayerSpec) -> ModGNNLayer:
-    """GCN + f_final of the paper: a matrix for each hop, then a three-layer network in place of the activation."""
+    """GCN + f_final of the paper: one matrix per hop, then a three-layer network in place of the activation."""
     f_mid = [nn.Linear(spec.inputs, LATENT, bias=hop == 0) for hop in range(spec.hops + 1)]
     f_final = spec.end(mlp(LATENT, spec.hidden, spec.outputs))
     return ModGNNLayer(spec.hops, f_pre=spec.scales(), f_mid=f_mid, f_final=f_final)
@@ -64,9 +64,9 @@ def gcn_final(spec: LayerSpec) -> ModGNNLayer:
 
 @MODELS.register("central")
 def central(spec: LayerSpec) -> CentralLayer:
-    """The paper's centralised baseline: four linear layers from all observations to all actions, for one N only."""
+    """The paper's centralised baseline: four linear layers from all observations to all actions, for a fixed N."""
     if spec.num_agents is None:
-        raise InputError("model 'central' reads all agents at once: give num_agents, the one number it will serve")
+        raise InputError("model 'central' reads all agents at once: give num_agents")
     if spec.head is None or spec.earlier:
         raise InputError("model 'central' has one layer; give layers=1")
     return CentralLayer(spec.num_agents, 6, spec.hidden, 3, scale=Scale(), head=spec.head)

@@ -1,4 +1,4 @@
-"""Compiled functions that fall back to plain ones."""
+"""Compilation that falls back to the plain function."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ __all__ = ["compiled"]
 Args = ParamSpec("Args")
 Result = TypeVar("Result")
 
-# A product and a sum in one instruction and one rounding: faster by a seventh in the physics.
+# Fused multiply-add, with one rounding instead of two: the physics takes a seventh less time.
 OPTIONS: dict[str, Any] = {"cpp.enable_floating_point_contract_flag": "fast"}
-SHAPES = 64  # sets of shapes and settings that one function is compiled for in one process
+MAX_COMPILATIONS = 64  # combinations of shapes and settings for which one function is compiled in one process
 
 
 def compiled(function: Callable[Args, Result], enabled: bool = True) -> Callable[Args, Result]:
-    """Compile a pure function of tensors with ``torch.compile``; where that fails, warn once and run it as it is.
+    """Compile a pure function of tensors with ``torch.compile``; if that fails, warn once and run it uncompiled.
 
-    It is compiled at the first call with new shapes, types or numbers, which takes seconds; PyTorch keeps the result
-    on disk, so that the next process needs less.
+    The first call with new shapes, types or numbers compiles, which takes seconds; PyTorch caches the result on disk
+    for the next process.
 
     Args:
         function: the function.
@@ -30,8 +30,8 @@ def compiled(function: Callable[Args, Result], enabled: bool = True) -> Callable
     """
     if not enabled:
         return function
-    # Each environment compiles for itself: what one of them was compiled for does not count against the others.
-    limits: dict[str, Any] = {"recompile_limit": SHAPES, "isolate_recompiles": True}
+    # Each environment compiles on its own: the compilations of one do not count towards the limit of another.
+    limits: dict[str, Any] = {"recompile_limit": MAX_COMPILATIONS, "isolate_recompiles": True}
     fast = torch.compile(function, fullgraph=True, dynamic=False, options=OPTIONS, **limits)
     works = True
 
@@ -40,8 +40,8 @@ def compiled(function: Callable[Args, Result], enabled: bool = True) -> Callable
         if works:
             try:
                 return fast(*args, **kwargs)
-            except Exception as error:  # whatever the compilers of this machine have against it
-                result = function(*args, **kwargs)  # what is wrong with the arguments is raised here
+            except Exception as error:  # compilers fail in many ways
+                result = function(*args, **kwargs)  # raises if the arguments are wrong
                 works = False
                 reason = (str(error).strip() or type(error).__name__).splitlines()[0]
                 name = getattr(function, "__name__", "a function")

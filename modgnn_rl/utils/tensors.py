@@ -23,25 +23,25 @@ __all__ = [
     "stack_padded",
 ]
 
-PAIRS_IN_BLOCK = {"cpu": 2**16}  # pairs compared together; fits the cache of one core
+PAIRS_IN_BLOCK = {"cpu": 2**16}  # pairs computed at a time; they fit the cache of one core
 PAIRS_IN_BLOCK_ELSEWHERE = 2**24
 
 
 def is_transformed() -> bool:
-    """Whether a compiler or a transform of ``torch.func`` is at work, under which shapes must not depend on data."""
+    """Whether code runs under a compiler or a ``torch.func`` transform, where shapes must not depend on data."""
     return torch.compiler.is_compiling() or is_functorch_active()
 
 
 def flatnonzero(mask: Tensor) -> Tensor:
-    """Where a mask [E] is true, ascending, int64; on a CPU by NumPy, in a tenth of the time that torch takes."""
+    """Indices where a mask [E] is true, ascending, int64; on the CPU computed by NumPy, ten times faster than torch."""
     if mask.device.type == "cpu" and not is_transformed():
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.nonzero().squeeze(-1)
 
 
 def mask_rows(value: Tensor, rows: Tensor, other: float = 0.0) -> Tensor:
-    """Value [R, ...] in the rows to keep, bool [R], and ``other`` elsewhere; what is NaN there reaches no gradient."""
-    # Choosing costs far more than looking whether there is anything to choose, where looking does not stall a device.
+    """Set the rows [R, ...] where a mask [R] is false to ``other``; NaN there reaches no gradient."""
+    # torch.where costs far more than this test, which does not stall a CPU.
     if value.device.type == "cpu" and not is_transformed() and rows.all():
         return value
     filling = torch.full((), other, dtype=value.dtype, device=value.device)
@@ -49,7 +49,7 @@ def mask_rows(value: Tensor, rows: Tensor, other: float = 0.0) -> Tensor:
 
 
 def stack_padded(tensors: Sequence[Tensor]) -> Tensor:
-    """Stack tensors [..., D_k] of any widths along the last dimension but one, filled up with zeros [..., K, D]."""
+    """Stack K tensors [..., D_k] of different widths, padded with zeros: [..., K, D]."""
     width = max(tensor.shape[-1] for tensor in tensors)
     return torch.stack([pad(tensor, (0, width - tensor.shape[-1])) for tensor in tensors], -2)
 
@@ -64,9 +64,9 @@ def clip_to_ball(vector: Tensor, radius: float) -> Tensor:
 
 
 def pair_differences(vector: Tensor, receivers: slice | None = None) -> tuple[Tensor, ...]:
-    """Differences of pairs, one tensor [..., R, N] a component of [..., N, D]: entry i, j is ``x_j - x_i``.
+    """Pairwise differences ``x_j - x_i`` of vectors [..., N, D], one tensor [..., R, N] per component.
 
-    Separate components keep everything that follows pointwise, several times faster on a CPU than [..., R, N, D].
+    With separate components all further operations are pointwise, several times faster on a CPU than [..., R, N, D].
 
     Args:
         vector: vectors x.
@@ -78,7 +78,7 @@ def pair_differences(vector: Tensor, receivers: slice | None = None) -> tuple[Te
 
 
 def pair_blocks(position: Tensor) -> Iterator[tuple[slice, slice]]:
-    """Cut all pairs of [B, N, D] into blocks that fit a cache: several whole flocks, or some agents of one against all.
+    """Split all pairs of [B, N, D] into blocks that fit the cache: whole flocks, or some agents of one against all.
 
     Yields:
         the flocks and the agents of each block, in the order of ``position.flatten(0, 1)``.
@@ -92,7 +92,7 @@ def pair_blocks(position: Tensor) -> Iterator[tuple[slice, slice]]:
 
 
 def squared_norm(components: Sequence[Tensor]) -> Tensor:
-    """Sum of the squares of components that are tensors of their own."""
+    """Sum of squares of components, each given as a separate tensor."""
     first, *others = components
     total = first * first
     for component in others:
@@ -101,7 +101,7 @@ def squared_norm(components: Sequence[Tensor]) -> Tensor:
 
 
 def pair_distances(position: Tensor) -> Tensor:
-    """Distances of all pairs [..., N, 3] -> [..., N, N]; infinite on the diagonal: nobody is its own neighbour."""
+    """Distances of all pairs [..., N, 3] -> [..., N, N]; infinite on the diagonal (no agent is its own neighbour)."""
     square = squared_norm(pair_differences(position))
     if torch.compiler.is_compiling():
         return square.masked_fill(torch.eye(square.shape[-1], dtype=torch.bool, device=square.device), torch.inf).sqrt()

@@ -297,7 +297,7 @@ def test_central_masks_agents_and_contains_nan() -> None:
 
 def test_central_serves_one_number_of_agents_and_says_so() -> None:
     policy = build("central", agents=4, seed=0).double()
-    with pytest.raises(InputError, match="made for 4 agents was given 5"):
+    with pytest.raises(InputError, match="a central model for 4 agents was given 5"):
         act(policy, *rollout(0, agents=5))
     with pytest.raises(InputError, match="give num_agents"):
         make_model("central")
