@@ -9,13 +9,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.aggregation import NodeFeatures, NodeInputs, aggregate, call_submodule
 from modgnn_rl.nn.graph import DenseGraph
+from modgnn_rl.nn.keys import as_tuple
 from modgnn_rl.nn.layer import ModGNNLayer
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.nn.window import mask_invalid
@@ -256,9 +257,9 @@ def edge_data(policy: ModGNN) -> EdgeData:
     Raises:
         InputError: it reads features; their number is not known.
     """
-    if policy._edge_keys["feature"] is not None:
+    if policy.edge_keys["feature"] is not None:
         raise InputError("this policy reads features of links: say how many, as in links=EdgeData(feature=2)")
-    return EdgeData(weight=policy._edge_keys["weight"] is not None)
+    return EdgeData(weight=policy.edge_keys["weight"] is not None)
 
 
 def own_data(policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tensor]) -> dict[tuple[str, ...], Tensor]:
@@ -267,8 +268,8 @@ def own_data(policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tens
     Raises:
         InputError: data are missing, or nobody reads them.
     """
-    keys = policy._own_keys()
-    found = {_as_tuple(name): value for name, value in given.items()}
+    keys = policy.own_keys()
+    found = {as_tuple(name): value for name, value in given.items()}
     if keys.get(("observation",)) == policy.in_keys[0]:
         found.setdefault(("observation",), observation)
     if found.keys() != keys.keys():
@@ -317,8 +318,3 @@ def _rows(
         wanted = ", ".join(map(str, ("M" if count is None else count, *row)))
         raise InputError(f"{name} are [{wanted}], not {list(values.shape)}")
     return values.to(like, copy=True)
-
-
-def _as_tuple(name: NestedKey) -> tuple[str, ...]:
-    key = unravel_key(name)
-    return key if isinstance(key, tuple) else (key,)

@@ -7,8 +7,9 @@ from torch import Tensor, nn
 
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.aggregation import NodeFeatures
+from modgnn_rl.nn.recorder import Recorder
 from modgnn_rl.nn.topology import Topology
-from modgnn_rl.nn.window import Recorder, mask_invalid
+from modgnn_rl.nn.window import mask_invalid
 from modgnn_rl.utils.tensors import mask_rows
 
 __all__ = ["CentralLayer"]

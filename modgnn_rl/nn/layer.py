@@ -16,8 +16,9 @@ from modgnn_rl.nn.aggregation import NodeFeatures, NodeInputs, aggregate, call_s
 from modgnn_rl.nn.communication import GraphShift, Laplacian
 from modgnn_rl.nn.delay import STARTS, previous_step
 from modgnn_rl.nn.graph import AGGREGATIONS
+from modgnn_rl.nn.recorder import Recorder
 from modgnn_rl.nn.topology import Topology
-from modgnn_rl.nn.window import Recorder, Window, call_where, mask_invalid, select
+from modgnn_rl.nn.window import Window, call_where, mask_invalid, select
 from modgnn_rl.utils.tensors import mask_rows, stack_padded
 
 __all__ = ["ModGNNLayer"]

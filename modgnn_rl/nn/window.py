@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from modgnn_rl.nn.aggregation import NodeFeatures, call_submodule
 from modgnn_rl.nn.graph import Graph
+from modgnn_rl.nn.recorder import Recorder
 from modgnn_rl.nn.topology import Topology
 from modgnn_rl.utils.tensors import flatnonzero, mask_rows
 
-__all__ = ["Recorder", "Window", "call_where", "mask_invalid", "select"]
-
-
-class Recorder(Protocol):
-    """Collects intermediate results."""
-
-    def wants(self, name: str, hop: int | None = None) -> bool:
-        """Whether the result of this name is requested."""
-
-    def record_nodes(self, name: str, hop: int | None, value: Tensor) -> None:
-        """Record a result of all agents, or of the targets [R, F]."""
-
-    def record_edges(self, name: str, hop: int, value: Tensor, graph: Graph) -> None:
-        """Record a result of all edges of a graph [E, F]."""
+__all__ = ["Window", "call_where", "mask_invalid", "select"]
 
 
 class Window(NamedTuple):

@@ -158,10 +158,10 @@ def test_intermediate_results_are_asked_for_by_key() -> None:
     assert policy.out_keys == out_keys
     assert set(run(policy, data).keys(True, True)) == before
     with pytest.raises(
-        InputError, match=r"'layers.0.f_con.1' is no intermediate .*; did you mean 'layers.0.f_com.1'\?"
+        InputError, match=r"'layers.0.f_con.1' is not an intermediate .*; did you mean 'layers.0.f_com.1'\?"
     ):
         policy.request("layers.0.f_con.1")
-    with pytest.raises(InputError, match=r"'layers.1.f_com.2' is no intermediate result of this policy"):
+    with pytest.raises(InputError, match=r"'layers.1.f_com.2' is not an intermediate result of this policy"):
         policy.request("layers.1.f_com.2")
-    with pytest.raises(InputError, match=r"'layers.0.f_finall' is to be renamed but not asked for; did you mean"):
+    with pytest.raises(InputError, match=r"'layers.0.f_finall' is renamed but not requested; did you mean"):
         policy.request("layers.0.f_final", rename={"layers.0.f_finall": "embedding"})

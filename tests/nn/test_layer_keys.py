@@ -111,11 +111,11 @@ def test_own_data_are_found_where_the_policy_is_told() -> None:
 @pytest.mark.parametrize(
     ("missing", "sentence"),
     [
-        (("agents", "observation"), r"^'agents.observation' is missing from the data; the policy reads it"),
-        ("adjacency", r"^'adjacency' is missing from the data; the policy reads it"),
-        ("weight", r"^'weight' is missing from the data; the policy reads it: add it, or name another key$"),
-        ("feature", r"^'feature' is missing from the data; the policy reads it"),
-        (("agents", "goal"), r"^'agents.goal' is missing from the data; a submodule, under 'own.goal', reads it"),
+        (("agents", "observation"), r"^'agents.observation' is missing from the data; the policy needs it"),
+        ("adjacency", r"^'adjacency' is missing from the data; the policy needs it"),
+        ("weight", r"^'weight' is missing from the data; the policy needs it: add it, or give another key$"),
+        ("feature", r"^'feature' is missing from the data; the policy needs it"),
+        (("agents", "goal"), r"^'agents.goal' is missing from the data; a submodule, under 'own.goal', needs it"),
     ],
 )
 def test_data_that_are_missing_are_named(missing: str | tuple[str, ...], sentence: str) -> None:
@@ -137,11 +137,15 @@ def test_a_submodule_cannot_read_what_links_do_not_have(name: str) -> None:
 @pytest.mark.parametrize(
     ("key", "shape", "sentence"),
     [
-        ("adjacency", (AGENTS, AGENTS), r"the adjacency has shape \(4, 4\); for these observations it begins \(5,\)"),
-        ("weight", (3, AGENTS, AGENTS), r"the weight of links has shape \(3, 4, 4\); .* it begins \(5,\)"),
-        (("agents", "goal"), (STEPS, 3, 1), r"'goal' \(read under 'own'\) has shape \(5, 3, 1\); .* begins \(5, 4\)"),
-        ("is_init", (STEPS,), r"the flag that an episode begins has shape \(5,\); .* it begins \(5, 1\)"),
-        ("messages", (STEPS, AGENTS, 2, 2), r"the stored messages has shape .*; .* it begins \(5, 4, 1\)"),
+        ("adjacency", (AGENTS, AGENTS), r"the adjacency has shape \(4, 4\), but .* need leading dimensions \(5,\)"),
+        ("weight", (3, AGENTS, AGENTS), r"the edge weight has shape \(3, 4, 4\), .* dimensions \(5,\)"),
+        (
+            ("agents", "goal"),
+            (STEPS, 3, 1),
+            r"'goal' \(read under 'own'\) has shape \(5, 3, 1\), .* dimensions \(5, 4\)",
+        ),
+        ("is_init", (STEPS,), r"the flag that an episode begins has shape \(5,\), .* dimensions \(5, 1\)"),
+        ("messages", (STEPS, AGENTS, 2, 2), r"the stored messages has shape .*, .* dimensions \(5, 4, 1\)"),
     ],
 )
 def test_data_of_another_shape_are_refused(key: str, shape: tuple[int, ...], sentence: str) -> None:

@@ -322,7 +322,7 @@ def random_step(window: TensorDict) -> TensorDict:
 def test_forgetfulness_warns_once() -> None:
     data = random_data(2, agents=3).exclude("is_init")
     policy = policies()["full"]
-    with pytest.warns(UserWarning, match=r"remembers nothing: append InitTracker\(\)"):
+    with pytest.warns(UserWarning, match=r"remembers no messages: append InitTracker\(\)"):
         policy(data)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -337,7 +337,7 @@ def test_a_step_in_mid_flight_without_messages_warns() -> None:
         warnings.simplefilter("error")
         policies()["full"](data.clone())
     data["is_init"][1] = False
-    with pytest.warns(UserWarning, match="no 'messages' in mid-rollout"):
+    with pytest.warns(UserWarning, match="'messages' in mid-episode, is missing"):
         policies()["full"](data)
 
 
