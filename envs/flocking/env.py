@@ -22,17 +22,17 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, MarlGroupMapType
 
-from modgnn_rl.configs.schema import REFERENCE_SIZE, FlockingConfig, as_list
+from modgnn_rl.configs.schema import FlockingConfig, as_list
 from modgnn_rl.configs.settings import check
+from modgnn_rl.envs.flocking.initial_states import given_states, initial_positions, move_padding_away
 from modgnn_rl.envs.flocking.leader import make_leader
-from modgnn_rl.envs.flocking.nonfinite import check_finite, nonfinite_agents, nonfinite_message
+from modgnn_rl.envs.flocking.nonfinite import check_finite
 from modgnn_rl.envs.flocking.perturbations import Perturbations
 from modgnn_rl.envs.flocking.physics.engine import TorchPhysics, make_physics
 from modgnn_rl.envs.flocking.radio import adjacency_matrix, edge_list
 from modgnn_rl.envs.flocking.rewards import LIMITS, reward_weights, step_outcome
 from modgnn_rl.envs.flocking.snapshots import check_snapshot
 from modgnn_rl.envs.flocking.specs import edge_capacity, make_specs
-from modgnn_rl.envs.flocking.starts import start_positions
 from modgnn_rl.errors import InputError, suggestion
 from modgnn_rl.utils.compile import compiled
 from modgnn_rl.utils.seeds import derive_seed
@@ -41,7 +41,6 @@ from modgnn_rl.utils.tensors import clip_to_ball
 __all__ = ["FlockingEnv", "checked_config"]
 
 PARTS = ("physics", "leader", "perturbations")  # attributes with a state of their own
-FAR_APART = 1e4  # m; spacing of the positions given to agents that do not exist
 
 
 class FlockingEnv(EnvBase):
@@ -155,11 +154,13 @@ class FlockingEnv(EnvBase):
         mask = self.done_spec["done"].one() if mask is None else mask
         rows = mask.view(-1).nonzero().view(-1)
         if set_state and tensordict is not None:
-            position, velocity = self._given_state(tensordict)[rows].split(3, -1)
+            position, velocity = given_states(tensordict, self.exists, self.dtype)[rows].split(3, -1)
         else:
-            position = self._start(rows)
+            position = initial_positions(
+                self.config, self.exists[rows], is_mixed=self.is_mixed, generator=self.generator, dtype=self.dtype
+            )
             velocity = torch.zeros_like(position)
-        self.physics.reset(rows, position, velocity)
+        self.physics.reset(rows, move_padding_away(position, self.exists[rows]), velocity)
         self.leader.reset(mask, self.generator)
         self.target_velocity = self.target_velocity.masked_fill(mask.unsqueeze(-1), 0.0)
         self.step_count = self.step_count.masked_fill(mask, 0)
@@ -173,49 +174,6 @@ class FlockingEnv(EnvBase):
         self.perturbations.reset(mask, state)
         adjacency, _ = self.communication_graph(position)
         return self._emit(state, adjacency, is_new=False).update(self.full_done_spec.zero())
-
-    def _start(self, rows: Tensor) -> Tensor:
-        """Initial positions of the flocks ``rows`` [R], m [R, N, 3]."""
-        config = self.config
-        radius = config.start_radius * (self.sizes[rows] / REFERENCE_SIZE).to(self.dtype) ** (1 / 3)
-        position = start_positions(
-            config.start,
-            len(rows),
-            self.num_agents,
-            radius if self.is_mixed else config.start_radius * (self.num_agents / REFERENCE_SIZE) ** (1 / 3),
-            config.start_distance,
-            config.start_clusters,
-            generator=self.generator,
-            dtype=self.dtype,
-            exists=self.exists[rows] if self.is_mixed else None,
-        )
-        return self._move_padding_away(position, self.exists[rows])
-
-    def _move_padding_away(self, position: Tensor, exists: Tensor) -> Tensor:
-        """Positions [R, N, 3] in which agents that do not exist are out of everyone's range."""
-        if not self.is_mixed:
-            return position
-        away = torch.arange(1, self.num_agents + 1, device=self.device, dtype=self.dtype) * FAR_APART
-        return torch.where(exists.unsqueeze(-1), position, away.unsqueeze(-1))
-
-    def _given_state(self, tensordict: TensorDictBase) -> Tensor:
-        """The state to start from, [B, N, 6]."""
-        agents = tensordict.get("agents", TensorDict())
-        state = agents.get("state", agents.get("observation", None))
-        expected = (*self.batch_size, self.num_agents, 6)
-        if state is None or tuple(state.shape) != expected:
-            found = "nothing" if state is None else f"shape {tuple(state.shape)}"
-            raise InputError(
-                f"reset(..., set_state=True) needs positions and velocities of shape {expected} under "
-                f"('agents', 'state'); there is {found}"
-            )
-        state = state.to(self.dtype)
-        bad = nonfinite_agents(state, self.exists)
-        if bad is not None:
-            reason = nonfinite_message("state", state, bad, self.step_count)
-            raise InputError(f"{reason}; give finite positions (m) and velocities (m/s)")
-        state = state.masked_fill(~self.exists.unsqueeze(-1), 0.0)
-        return torch.cat((self._move_padding_away(state[..., :3], self.exists), state[..., 3:]), -1)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         push = self.perturbations.step()

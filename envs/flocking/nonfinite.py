@@ -65,19 +65,19 @@ def nonfinite_agents(value: Tensor, counts: Tensor | None = None) -> Tensor | No
     return bad if bad.any() else None
 
 
-def nonfinite_message(name: str, value: Tensor, bad: Tensor, step_count: Tensor) -> str:
+def nonfinite_message(name: str, value: Tensor, bad: Tensor, step_count: Tensor | None = None) -> str:
     """The first clause of an error message.
 
     Args:
         name: what the values are.
         value: one vector per agent [B, N, D].
         bad: agents found by `nonfinite_agents`, bool [B, N].
-        step_count: steps since each flock's reset [B, 1].
+        step_count: steps since each flock's reset [B, 1]; default: not mentioned.
     """
     flock, agent = bad.nonzero()[0].tolist()
     found = value[flock, agent]
     more = int(bad.any(-1).sum()) - 1
     others = f", as in {more} other flock{'s' if more > 1 else ''}" if more else ""
     wrong = "too large to compute with" if found.isfinite().all() else "NaN or infinite"
-    step = int(step_count[flock])
-    return f"the {name} of agent {agent} in flock {flock} at step {step} is {wrong} ({found.tolist()}){others}"
+    when = "" if step_count is None else f" at step {int(step_count[flock])}"
+    return f"the {name} of agent {agent} in flock {flock}{when} is {wrong} ({found.tolist()}){others}"

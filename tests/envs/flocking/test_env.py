@@ -526,7 +526,7 @@ def test_some_flocks_start_at_given_states() -> None:
     [
         (torch.zeros(2, 3, 6), r"of shape \(2, 4, 6\).*there is shape \(2, 3, 6\)"),
         (None, "there is nothing"),
-        (torch.full((2, 4, 6), NAN), "the state of agent 0 in flock 0 at step 0 is NaN or infinite"),
+        (torch.full((2, 4, 6), NAN), "the state of agent 0 in flock 0 is NaN or infinite"),
     ],
 )
 def test_invalid_states_are_errors(state: Tensor | None, message: str) -> None:
