@@ -1,0 +1,11 @@
+from .collectors.behaviour import ActionNoise as ActionNoise
+from .collectors.behaviour import BetaMixture as BetaMixture
+from .collectors.behaviour import Ensemble as Ensemble
+from .collectors.behaviour import SafetyGate as SafetyGate
+from .imitation.learner import ImitationLearner as ImitationLearner
+from .loop.callbacks import Callback as Callback
+from .loop.callbacks import StopOnPlateau as StopOnPlateau
+from .loop.context import TrainContext as TrainContext
+from .loop.setup import make_learner as make_learner
+from .loop.training_loop import TrainingLoop as TrainingLoop
+from .ppo.learner import PPOLearner as PPOLearner
