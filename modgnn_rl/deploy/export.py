@@ -268,7 +268,7 @@ def write_agent(folder: Path, files: Mapping[str, bytes]) -> None:
     """
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with write_folder(folder) as temporary:
+        with write_folder(folder, hidden=True) as temporary:
             for name, content in files.items():
                 (temporary / name).write_bytes(content)
     except OSError as error:

@@ -15,13 +15,15 @@ __all__ = ["describe_files", "verify_files", "write_folder"]
 
 
 @contextlib.contextmanager
-def write_folder(path: Path) -> Iterator[Path]:
+def write_folder(path: Path, *, hidden: bool = False) -> Iterator[Path]:
     """Create or replace a folder atomically.
 
     A crash leaves the old folder, the new one, or the old one as ``<path>.old``.
 
     Args:
         path: the folder; its parent must exist.
+        hidden: use names that belong to this process, ``.<name>.<pid>.tmp`` and ``.<name>.<pid>.old``, where the parent
+            is the user's own and may hold a ``<path>.old`` or ``<path>.tmp``, which would be removed.
 
     Yields:
         an empty folder ``<path>.tmp`` to write the files into. When the block ends without an exception, its files are
@@ -30,7 +32,8 @@ def write_folder(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be written.
     """
-    temporary, older = path.with_name(f"{path.name}.tmp"), path.with_name(f"{path.name}.old")
+    name = f".{path.name}.{os.getpid()}" if hidden else path.name
+    temporary, older = path.with_name(f"{name}.tmp"), path.with_name(f"{name}.old")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         temporary.mkdir()
@@ -56,7 +59,7 @@ def _replace(temporary: Path, path: Path, older: Path) -> None:
     os.replace(path, older)
     try:
         os.replace(temporary, path)
-    except OSError:
+    except BaseException:  # Ctrl-C, too
         os.replace(older, path)
         raise
 

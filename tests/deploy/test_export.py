@@ -337,6 +337,16 @@ def test_a_folder_of_something_else_stays(tmp_path: Path) -> None:
     assert (tmp_path / "thesis.tex").read_text() == "all of it"
 
 
+def test_folders_of_the_user_beside_an_export_are_kept(tmp_path: Path) -> None:
+    for name in ("agent.old", "agent.tmp"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine").write_bytes(b"mine")
+    for content in (b"first", b"second"):
+        export.write_agent(tmp_path / "agent", {"agent.json": content})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["agent", "agent.old", "agent.tmp"]
+    assert all((tmp_path / name / "mine").read_bytes() == b"mine" for name in ("agent.old", "agent.tmp"))
+
+
 @pytest.mark.parametrize("broken", ["fsync_file", "fsync_folder"])
 def test_a_full_disk_leaves_the_older_export(broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export.write_agent(tmp_path / "agent", {"agent.json": b"old", "agent.onnx": b"old"})

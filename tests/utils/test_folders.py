@@ -26,20 +26,25 @@ def test_a_folder_is_created_and_replaced(tmp_path: Path) -> None:
         assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
+@pytest.mark.parametrize(
+    "error", [OSError(5, "Input/output error"), KeyboardInterrupt("Ctrl-C")], ids=["disk", "ctrl-c"]
+)
 @pytest.mark.parametrize("failing", [1, 2])
-def test_a_failed_rename_leaves_the_older_folder(failing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_rename_leaves_the_older_folder(
+    failing: int, error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write(tmp_path / "set", b"old")
     replace, calls = os.replace, []
 
     def fail(source: Path, target: Path) -> None:
         calls.append(source)
         if len(calls) == failing:
-            raise OSError(5, "Input/output error")
+            raise error
         replace(source, target)
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", fail)
-        with pytest.raises(OSError, match="Input/output error"):
+        with pytest.raises(type(error)):
             write(tmp_path / "set", b"new")
     assert contents(tmp_path / "set") == {"a": b"old"}
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
