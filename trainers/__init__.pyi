@@ -2,6 +2,9 @@ from .collectors.behaviour import ActionNoise as ActionNoise
 from .collectors.behaviour import BetaMixture as BetaMixture
 from .collectors.behaviour import Ensemble as Ensemble
 from .collectors.behaviour import SafetyGate as SafetyGate
+from .collectors.local import LocalCollector as LocalCollector
+from .collectors.remote import RemoteCollector as RemoteCollector
+from .collectors.remote import make_collector as make_collector
 from .imitation.learner import ImitationLearner as ImitationLearner
 from .loop.callbacks import Callback as Callback
 from .loop.callbacks import StopOnPlateau as StopOnPlateau
