@@ -1,6 +1,6 @@
-"""A policy as one robot runs it: with its own observation, its own memory, and the messages that reach it.
+"""A policy as one robot runs it: from its own observation, its own memory, and the messages that it receives.
 
-`step` is the computation, a pure function of tensors that can be exported; `Agent` remembers what it returns.
+`step` is the computation, a pure function of tensors that can be exported; `Agent` keeps its state between steps.
 """
 
 from __future__ import annotations
@@ -26,80 +26,82 @@ __all__ = ["Agent", "EdgeData", "check_local", "edge_data", "no_messages", "own_
 
 
 class EdgeData(NamedTuple):
-    """What is known of each link beside the message that comes over it.
+    """What an agent knows about each incoming edge beside the message.
 
     Attributes:
-        weight: whether links have a weight.
-        feature: number of features of a link F.
+        weight: whether edges have a weight.
+        feature: number of features per edge F.
     """
 
     weight: bool = False
     feature: int = 0
 
     def example(self, count: int, like: Tensor) -> dict[str, Tensor]:
-        """Such data of some links as `step` takes them, ones, of the dtype and on the device of ``like``."""
+        """Such data for some edges as `step` takes them, all ones, with the dtype and device of ``like``."""
         data = {"weight": like.new_ones(count)} if self.weight else {}
         return data | ({"feature": like.new_ones(count, self.feature)} if self.feature else {})
 
 
 class Agent:
-    """One robot that flies by a `ModGNN` policy and needs nothing but what it sees and hears.
+    """One robot that runs a `ModGNN` policy from its own observation and received messages alone.
 
     At every control step::
 
         message = agent.observe(observation)  # broadcast this
-        agent.receive(messages)  # what the neighbours broadcast, as far as it arrived
+        agent.receive(messages)  # the neighbours' broadcasts that arrived
         action = agent.act()
 
-    Together the agents do what the policy does for all of them. A message that is lost is a link that is missing; an
-    agent that reboots or joins begins with `reset` and holds nothing, which its messages say with NaN.
+    Together the agents compute the same actions as the policy for all of them. A lost message is a missing edge. An
+    agent that reboots or joins calls `reset` and holds nothing, which its messages express as NaN.
 
     Args:
         policy: layers of `ModGNNLayer`, in evaluation mode; agents may share it.
-        links: what is known of links; default: what the keys of the policy say. Needed where weights come from a
-            floating-point adjacency, and where links have features.
+        edges: edge data that the agent receives; default: inferred from the policy's keys. Required if weights come
+            from a floating-point adjacency, or if edges have features.
 
     Raises:
         InputError: the policy needs more than one agent knows, see `check_local`.
     """
 
-    def __init__(self, policy: ModGNN, links: EdgeData | None = None) -> None:
+    def __init__(self, policy: ModGNN, edges: EdgeData | None = None) -> None:
         check_local(policy)
         self.policy = policy
-        self.links = edge_data(policy) if links is None else links
+        self.edges = edge_data(policy) if edges is None else edges
         self._features: int | None = None
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: a reboot, or the start of an episode."""
         self._messages: Tensor | None = None
-        self._seen: tuple[Tensor, NodeFeatures] | None = None
-        self._heard: dict[str, Tensor] | None = None
+        self._observed: tuple[Tensor, NodeFeatures] | None = None
+        self._received: dict[str, Tensor] | None = None
 
     @torch.no_grad()
     def observe(self, observation: Tensor, own: Mapping[NestedKey, Tensor] | None = None) -> Tensor:
-        """Begin a step.
+        """Start a step.
 
         Args:
             observation: o [F].
             own: further data of the agent for keyed submodules, by their name under ``"own"`` [...].
 
         Returns:
-            the message to broadcast now [K, D]: what the agent gathered up to the step before.
+            the message to broadcast now [K, D], from data up to the previous step.
 
         Raises:
-            InputError: out of turn, or for data that the policy cannot read.
+            InputError: called out of order, or the policy cannot read the data.
         """
-        if self._seen is not None:
-            raise InputError("observe came twice in a step; the order is observe, receive, act; reset starts over")
+        if self._observed is not None:
+            raise InputError(
+                "observe was called twice in a step; call observe, receive, act in turn; reset starts over"
+            )
         if observation.ndim != 1 or self._features not in (None, len(observation)):
             wanted = "[F]" if self._features is None else [self._features]
             raise InputError(f"the observation of one agent is {wanted}, not {list(observation.shape)}")
         data = own_data(self.policy, observation, own or {})
         if self._messages is None:
-            self._messages = no_messages(self.policy, observation, data, self.links)
+            self._messages = no_messages(self.policy, observation, data, self.edges)
         self._features = len(observation)
-        self._seen = observation.clone(), {name: value.clone() for name, value in data.items()}
+        self._observed = observation.clone(), {name: value.clone() for name, value in data.items()}
         return self._messages.clone()
 
     def receive(
@@ -109,45 +111,45 @@ class Agent:
         weight: Tensor | Sequence[float] | None = None,
         feature: Tensor | Sequence[Tensor] | None = None,
     ) -> None:
-        """Take the messages that arrived in this step, in any order.
+        """Receive the messages that arrived in this step, in any order.
 
         Args:
             messages: what the neighbours returned from `observe`, [M, K, D] or a sequence of [K, D]; M may be zero.
-            weight: weights of the links that they came over [M].
-            feature: features of these links [M, F].
+            weight: weights of their edges [M].
+            feature: features of their edges [M, F].
 
         Raises:
-            InputError: out of turn, or for data of another shape.
+            InputError: called out of order, or data have the wrong shape.
         """
-        if self._seen is None or self._messages is None:
-            raise InputError("receive came before observe; the order is observe, receive, act")
-        if self._heard is not None:
-            raise InputError("receive came twice in a step; give it all messages at once")
+        if self._observed is None or self._messages is None:
+            raise InputError("receive was called before observe; the order is observe, receive, act")
+        if self._received is not None:
+            raise InputError("receive was called twice in a step; pass all messages at once")
         inbox = _rows("messages", messages, self._messages.shape, self._messages)
-        heard = {"inbox": inbox}
-        for name, given, width in (("weight", weight, ()), ("feature", feature, (self.links.feature,))):
-            has_it = bool(getattr(self.links, name))
+        received = {"inbox": inbox}
+        for name, given, width in (("weight", weight, ()), ("feature", feature, (self.edges.feature,))):
+            has_it = bool(getattr(self.edges, name))
             rows = [] if given is None and has_it and len(inbox) == 0 else given
             if (rows is not None) != has_it:
                 need = "needs" if has_it else "was built without"
-                raise InputError(f"this agent {need} the {name} of links; its EdgeData is {tuple(self.links)}")
+                raise InputError(f"this agent {need} an edge {name}; its EdgeData is {tuple(self.edges)}")
             if rows is not None:
-                heard[name] = _rows(f"the {name} of links", rows, width, self._messages, len(inbox))
-        self._heard = heard
+                received[name] = _rows(f"the edge {name}", rows, width, self._messages, len(inbox))
+        self._received = received
 
     @torch.no_grad()
     def act(self) -> Tensor:
-        """End the step: return the action [O], and remember what to broadcast in the next step.
+        """End the step: return the action [O], and store the message to broadcast in the next step.
 
         Raises:
-            InputError: out of turn.
+            InputError: called out of order.
         """
-        if self._seen is None or self._messages is None or self._heard is None:
-            missing = "observe" if self._seen is None else "receive, which takes [] where nothing was heard"
-            raise InputError(f"act came before {missing}; the order is observe, receive, act")
-        observation, own = self._seen
-        action, self._messages = step(self.policy, observation, self._messages, **self._heard, own=own)
-        self._seen = self._heard = None
+        if self._observed is None or self._messages is None or self._received is None:
+            missing = "observe" if self._observed is None else "receive (pass [] if nothing arrived)"
+            raise InputError(f"act was called before {missing}; the order is observe, receive, act")
+        observation, own = self._observed
+        action, self._messages = step(self.policy, observation, self._messages, **self._received, own=own)
+        self._observed = self._received = None
         return action
 
 
@@ -168,18 +170,18 @@ def step(
         messages: what the agent returned one step earlier [K, D]; NaN for what it does not hold.
         inbox: what each neighbour returned one step earlier [M, K, D]; M may be zero.
         own: the agent's data for keyed submodules, see `own_data` [...].
-        weight: weights of the links [M].
-        feature: features of the links [M, F].
+        weight: edge weights [M].
+        feature: edge features [M, F].
 
     Returns:
         action [O], and messages [K, D] for itself and its neighbours in the next step.
     """
-    # The agent itself stands first, as a sender that nobody hears: so there is always somebody to take a maximum over.
+    # The agent itself is the first sender, without an edge, so that maxima over senders are never empty.
     stored = torch.cat((messages.unsqueeze(0), inbox))
-    hears = torch.arange(stored.shape[0], device=stored.device) > 0
+    is_neighbour = torch.arange(stored.shape[0], device=stored.device) > 0
     weight = None if weight is None else pad(weight, (1, 0))
     feature = None if feature is None else pad(feature, (0, 0, 1, 0))
-    links = DenseGraph(hears.view(1, 1, -1), weight, feature)
+    graph = DenseGraph(is_neighbour.view(1, 1, -1), weight, feature)
     holds = stored.isfinite().all(-1)
     stored = torch.where(holds.unsqueeze(-1), stored, 0.0)
 
@@ -187,7 +189,7 @@ def step(
     seen, sent, first = observation.unsqueeze(0), [], 0
     for layer in policy.layers:
         hops = slice(first, first + layer.hops)
-        output, sends = _layer_step(layer, seen, tables, stored[:, hops], holds[:, hops], links)
+        output, sends = _layer_step(layer, seen, tables, stored[:, hops], holds[:, hops], graph)
         seen = torch.cat((seen, output), -1)
         first += layer.hops
         sent.append(sends)
@@ -195,24 +197,24 @@ def step(
 
 
 def _layer_step(
-    layer: ModGNNLayer, observation: Tensor, own: NodeFeatures, stored: Tensor, holds: Tensor, links: DenseGraph
+    layer: ModGNNLayer, observation: Tensor, own: NodeFeatures, stored: Tensor, holds: Tensor, graph: DenseGraph
 ) -> tuple[Tensor, Tensor]:
-    """One layer, as `ModGNNLayer` defines it, for the one receiver of a graph.
+    """One layer as `ModGNNLayer` defines it, for a graph with one receiver.
 
     Args:
         layer: the layer.
-        observation: what the layer sees [1, F].
+        observation: input of the layer [1, F].
         own: the agent's own data [1, ...].
-        stored: what the senders, of which the agent is the first, held one step earlier [S, K, D].
-        holds: which of it they held, bool [S, K].
-        links: the graph.
+        stored: what the senders (the agent is the first) held one step earlier [S, K, D].
+        holds: which hops they held, bool [S, K].
+        graph: edges from these senders to the agent.
 
     Returns:
         output [1, O], and messages [K, D'] of this step.
     """
     seen, tables, sees = mask_invalid(observation, own)
     tables[("input",)] = seen
-    # Modules may work in place; what they are given here is read again.
+    # Submodules may work in place, so they get a copy of what is read again.
     data, held = call_submodule(layer.f_input, seen.clone(), tables), sees
     total = call_submodule(layer.f_mid[0], call_submodule(layer.f_pre[0], data.clone(), tables), tables)
     sent = []
@@ -222,21 +224,21 @@ def _layer_step(
         if layer.start == "zero":
             they_hold = torch.ones_like(they_hold)
         held = they_hold[:1]
-        graph, incoming = links.subgraph(they_hold, held), NodeInputs(senders, senders[:1], tables)
+        edges, incoming = graph.subgraph(they_hold, held), NodeInputs(senders, senders[:1], tables)
         f_com = layer.f_com[hop - 1]
-        if hop < layer.hops:  # before f_pre works on the messages, maybe in place
-            data = aggregate(graph, f_com, nn.Identity(), incoming, layer.aggregation)
-        summed = aggregate(graph, f_com, layer.f_pre[hop], incoming, layer.aggregation)
+        if hop < layer.hops:  # before f_pre, which may change the messages in place
+            data = aggregate(edges, f_com, nn.Identity(), incoming, layer.aggregation)
+        summed = aggregate(edges, f_com, layer.f_pre[hop], incoming, layer.aggregation)
         total = total + mask_rows(call_submodule(layer.f_mid[hop], summed, tables), held)
     output = mask_rows(call_submodule(layer.f_final, total, tables), sees, torch.nan)
     return output, torch.stack(_of_one_width(sent)) if sent else data.new_zeros(0, data.shape[-1])
 
 
 def check_local(policy: ModGNN) -> None:
-    """Make sure that one agent's observation and messages are all that a policy needs.
+    """Check that one agent's observation and messages are all that a policy needs.
 
     Raises:
-        InputError: for a layer that is no `ModGNNLayer` (a central model), or ``start="repeat"``.
+        InputError: a layer is not a `ModGNNLayer` (a central model), or has ``start="repeat"``.
     """
     for number, layer in enumerate(policy.layers):
         if not isinstance(layer, ModGNNLayer):
@@ -252,13 +254,13 @@ def check_local(policy: ModGNN) -> None:
 
 
 def edge_data(policy: ModGNN) -> EdgeData:
-    """What a policy reads of links, as far as its keys say.
+    """The edge data that a policy reads, according to its keys.
 
     Raises:
-        InputError: it reads features; their number is not known.
+        InputError: it reads edge features, whose number is unknown.
     """
     if policy.edge_keys["feature"] is not None:
-        raise InputError("this policy reads features of links: say how many, as in links=EdgeData(feature=2)")
+        raise InputError("this policy reads edge features: give their number, as in edges=EdgeData(feature=2)")
     return EdgeData(weight=policy.edge_keys["weight"] is not None)
 
 
@@ -266,7 +268,7 @@ def own_data(policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tens
     """The data that the keyed submodules of a policy read under ``"own"``, by name; the observation may be among them.
 
     Raises:
-        InputError: data are missing, or nobody reads them.
+        InputError: data are missing, or are not read by any submodule.
     """
     keys = policy.own_keys()
     found = {as_tuple(name): value for name, value in given.items()}
@@ -274,12 +276,12 @@ def own_data(policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tens
         found.setdefault(("observation",), observation)
     if found.keys() != keys.keys():
         wanted, there = (sorted(".".join(name) for name in names) for names in (keys, found))
-        raise InputError(f"the submodules of this policy read {wanted} of the agent's own data, and got {there}")
+        raise InputError(f"the submodules of this policy read {wanted} of the agent's own data, but got {there}")
     return found
 
 
-def no_messages(policy: ModGNN, observation: Tensor, own: NodeFeatures, links: EdgeData) -> Tensor:
-    """The messages of an agent that holds nothing, NaN [K, D]; their width is found by a step without neighbours.
+def no_messages(policy: ModGNN, observation: Tensor, own: NodeFeatures, edges: EdgeData) -> Tensor:
+    """The messages of an agent that holds nothing, NaN [K, D]; a step without neighbours determines their width.
 
     Raises:
         InputError: the policy cannot read the observation.
@@ -287,7 +289,7 @@ def no_messages(policy: ModGNN, observation: Tensor, own: NodeFeatures, links: E
     unknown = observation.new_full((policy.hops, 1), torch.nan)
     nobody = observation.new_zeros(0, policy.hops, 1)
     try:
-        _, messages = step(policy, observation, unknown, nobody, own, **links.example(0, observation))
+        _, messages = step(policy, observation, unknown, nobody, own, **edges.example(0, observation))
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"the policy cannot read an observation of {len(observation)} numbers: {reason}") from error
@@ -295,7 +297,7 @@ def no_messages(policy: ModGNN, observation: Tensor, own: NodeFeatures, links: E
 
 
 def _of_width(data: Tensor, width: int) -> Tensor:
-    """Data [..., D] filled up with zeros, or cut, to a width; nothing that a file would have to do where it fits."""
+    """Pad data [..., D] with zeros, or cut them, to a width; adds no operation to an export if the width fits."""
     return data if data.shape[-1] == width else pad(data, (0, width - data.shape[-1]))
 
 
@@ -307,7 +309,7 @@ def _of_one_width(rows: Sequence[Tensor]) -> list[Tensor]:
 def _rows(
     name: str, values: Tensor | Sequence[Any], row: Sequence[int], like: Tensor, count: int | None = None
 ) -> Tensor:
-    """A copy of rows [M, *row], given as one tensor or one by one, in the dtype and on the device of ``like``."""
+    """A copy of rows [M, *row], given as one tensor or a sequence, with the dtype and device of ``like``."""
     if not isinstance(values, Tensor):
         parts = [torch.as_tensor(value, dtype=like.dtype, device=like.device) for value in values]
         wrong = next((part for part in parts if part.shape != torch.Size(row)), None)

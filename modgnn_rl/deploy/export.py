@@ -1,4 +1,4 @@
-"""Policies as files that fly a robot: ``torch.export`` and ONNX, checked against the policy before they are written."""
+"""Export of policies for robots, as ``torch.export`` and ONNX files that are checked against the policy."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Inputs = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export made.
+    """The result of an export.
 
     Attributes:
         folder: holds ``agent.onnx``, ``agent.pt2``, ``agent.json`` and ``onnx_agent.py``.
@@ -56,27 +56,27 @@ def export_agent(
     observation: Tensor,
     *,
     own: Mapping[NestedKey, Tensor] | None = None,
-    links: EdgeData | None = None,
+    edges: EdgeData | None = None,
     model: str | None = None,
     control_frequency: float | None = None,
 ) -> Exported:
     """Export what one agent computes in a step, `modgnn_rl.deploy.agent.step`, for any number of neighbours.
 
     Nothing is written unless the files compute what the policy does, to `TOLERANCE`, on a short random rollout with 0
-    to 40 neighbours. `modgnn_rl.deploy.onnx_agent.OnnxAgent` flies them.
+    to 40 neighbours. `modgnn_rl.deploy.onnx_agent.OnnxAgent` runs them.
 
     Args:
         policy: see `modgnn_rl.deploy.agent.check_local`; a copy in evaluation mode is exported.
         folder: where the files go; it may hold an earlier export, which is replaced as a whole.
         observation: an example of an observation [F], for its width and dtype, float32 or float64.
         own: examples of the agent's own data for keyed submodules, by name [...].
-        links: what is known of links, as for `modgnn_rl.deploy.agent.Agent`.
+        edges: edge data, as for `modgnn_rl.deploy.agent.Agent`.
         model: name of the policy, for ``agent.json``.
         control_frequency: steps a second that the policy was trained for, Hz, for ``agent.json``.
 
     Raises:
-        InputError: packages are missing, the policy cannot fly agent by agent, the files would differ from it, or the
-            folder cannot be written.
+        InputError: packages are missing, the policy cannot run on single agents, the files would differ from it, or
+            the folder cannot be written.
     """
     check_packages()
     check_local(policy)
@@ -86,7 +86,7 @@ def export_agent(
         raise InputError(f"an agent is exported for float32 or float64, not for observations of {observation.dtype}")
     policy = copy.deepcopy(policy).cpu().eval()
     with torch.no_grad():
-        inputs = _example_inputs(policy, observation, own or {}, edge_data(policy) if links is None else links)
+        inputs = _example_inputs(policy, observation, own or {}, edge_data(policy) if edges is None else edges)
         module = _Step(policy, list(inputs))
         program, onnx_model = _trace(module, inputs)
         difference = _largest_difference(module, program, onnx_model, inputs)
@@ -110,7 +110,7 @@ def export_agent(
 
 
 def check_packages() -> None:
-    """Make sure that the packages of the extra ``export`` are there.
+    """Check that the packages of the extra ``export`` are installed.
 
     Raises:
         InputError: one is missing.
@@ -121,7 +121,7 @@ def check_packages() -> None:
 
 
 class _Step(nn.Module):
-    """`step` of a policy with its inputs in a row, as ``torch.export`` wants them.
+    """`step` of a policy with positional inputs, as ``torch.export`` needs them.
 
     Args:
         policy: the policy.
@@ -140,15 +140,15 @@ class _Step(nn.Module):
 
 
 def _example_inputs(
-    policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tensor], links: EdgeData, neighbours: int = 3
+    policy: ModGNN, observation: Tensor, given: Mapping[NestedKey, Tensor], edges: EdgeData, neighbours: int = 3
 ) -> Inputs:
     """Inputs of a step by name, in the order in which the files take them."""
     observation = observation.cpu()
     own = {name: value.cpu() for name, value in own_data(policy, observation, given).items()}
-    messages = no_messages(policy, observation, own, links)
+    messages = no_messages(policy, observation, own, edges)
     inputs = {"observation": observation, "messages": messages, "inbox": messages.expand(neighbours, -1, -1).clone()}
     inputs |= {".".join(("own", *name)): value for name, value in own.items() if value is not observation}
-    return inputs | links.example(neighbours, observation)
+    return inputs | edges.example(neighbours, observation)
 
 
 def _shape(name: str, value: Tensor) -> list[int | str]:
@@ -166,7 +166,7 @@ def _trace(module: _Step, inputs: Inputs) -> tuple[torch.export.ExportedProgram,
             program = torch.export.export(module, tuple(inputs.values()), dynamic_shapes=(dynamic,))
             for node in program.graph.nodes:
                 node.meta.pop("stack_trace", None)  # names folders of this machine
-            # The optimiser takes a small constant, x + 1e-8, for zero; onnxruntime has one of its own that does not.
+            # The optimiser would treat a small constant, x + 1e-8, as zero; the optimiser of onnxruntime does not.
             onnx_program = torch.onnx.export(
                 program,
                 input_names=list(inputs),
@@ -181,7 +181,7 @@ def _trace(module: _Step, inputs: Inputs) -> tuple[torch.export.ExportedProgram,
     assert onnx_program is not None
     model = onnx_program.model_proto
     for part in (*model.graph.node, *model.graph.input, *model.graph.output, *model.graph.initializer):
-        part.ClearField("metadata_props")  # what was exported from where, most of the file
+        part.ClearField("metadata_props")  # source locations, which take most of the file
     model.graph.ClearField("value_info")
     for size in (size for given in model.graph.input for size in given.type.tensor_type.shape.dim):
         if size.HasField("dim_param"):
@@ -197,7 +197,7 @@ def _largest_difference(
 
     try:
         session = open_session(onnx_model)
-    except Exception as error:  # those of onnxruntime have no ancestor of their own
+    except Exception as error:  # onnxruntime's exceptions have no common base class
         raise InputError(f"onnxruntime cannot run this policy: {str(error).splitlines()[0]}") from error
     exported = program.module()
     generator = torch.Generator().manual_seed(0)
@@ -213,7 +213,7 @@ def _largest_difference(
 
 
 def _random_inputs(inputs: Inputs, messages: Tensor, count: int, generator: torch.Generator) -> Inputs:
-    """A step with some neighbours: one of them holds what the agent holds itself, another holds less than the rest."""
+    """A random step: one neighbour holds the same as the agent, another holds fewer hops than the rest."""
     feed = dict(inputs)
     for name, value in inputs.items():
         if not name.startswith("own."):
@@ -277,7 +277,7 @@ def write_agent(folder: Path, files: Mapping[str, bytes]) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep the notices of PyTorch's exporters, on packages that nobody asked for, off the terminal."""
+    """Suppress notices of PyTorch's exporters about packages that are not needed."""
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

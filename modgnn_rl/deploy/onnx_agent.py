@@ -1,13 +1,13 @@
-"""Fly an exported agent with numpy and onnxruntime alone.
+"""Run an exported agent with NumPy and onnxruntime only.
 
-This file needs no other: the export puts a copy of it beside ``agent.onnx`` and ``agent.json``. On the robot::
+This file has no other dependency: the export puts a copy beside ``agent.onnx`` and ``agent.json``. On the robot::
 
     from onnx_agent import OnnxAgent
 
     agent = OnnxAgent("agent")  # the folder
-    while flying:
+    while running:
         message = agent.observe(observation)  # broadcast this
-        agent.receive(messages)  # what the neighbours broadcast, as far as it arrived
+        agent.receive(messages)  # the neighbours' broadcasts that arrived
         action = agent.act()
 """
 
@@ -32,20 +32,20 @@ Array = NDArray[Any]
 
 
 class AgentError(ValueError):
-    """A damaged export, data of the wrong shape, or a call out of turn, in one sentence."""
+    """A damaged export, data of the wrong shape, or a call out of order, in one sentence."""
 
 
 class OnnxAgent:
-    """One robot that flies by an exported policy; it does what `modgnn_rl.deploy.agent.Agent` does, on numpy arrays.
+    """One robot that runs an exported policy, like `modgnn_rl.deploy.agent.Agent` but on NumPy arrays.
 
     Args:
-        path: the folder that the export made, or ``agent.onnx`` in it. Its hash is checked.
+        path: the folder of the export, or ``agent.onnx`` in it. Its hash is checked.
 
     Attributes:
         metadata: the content of ``agent.json``: ``hops``, ``message_width``, ``control_frequency`` in Hz and more.
 
     Raises:
-        AgentError: there is no export, or it is damaged.
+        AgentError: the export is missing or damaged.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -53,9 +53,9 @@ class OnnxAgent:
         self.metadata, model = _load(folder)
         try:
             self._session = open_session(model)
-        except Exception as error:  # onnxruntime's have no base of their own
+        except Exception as error:  # onnxruntime's exceptions have no common base class
             reason = str(error).splitlines()[0]
-            raise AgentError(f"{folder / 'agent.onnx'} is no model that onnxruntime can run ({reason})") from error
+            raise AgentError(f"{folder / 'agent.onnx'} cannot be run by onnxruntime ({reason})") from error
         self._inputs: dict[str, tuple[list[Any], np.dtype[Any]]] = {
             name: (spec["shape"], np.dtype(spec["dtype"])) for name, spec in self.metadata["inputs"].items()
         }
@@ -68,30 +68,32 @@ class OnnxAgent:
         """Forget everything: a reboot, or the start of an episode."""
         shape, dtype = self._inputs["messages"]
         self._messages = np.full(shape, np.nan, dtype)
-        self._seen: dict[str, Array] | None = None
-        self._heard: dict[str, Array] | None = None
+        self._observed: dict[str, Array] | None = None
+        self._received: dict[str, Array] | None = None
 
     def observe(self, observation: ArrayLike, own: Mapping[str, ArrayLike] | None = None) -> Array:
-        """Begin a step.
+        """Start a step.
 
         Args:
             observation: o [F].
             own: further data of the agent, by name; ``"sensors.battery"`` for nested names.
 
         Returns:
-            the message to broadcast now [K, D]: what the agent gathered up to the step before.
+            the message to broadcast now [K, D], from data up to the previous step.
 
         Raises:
-            AgentError: out of turn, or for data of another shape.
+            AgentError: called out of order, or data have the wrong shape.
         """
-        if self._seen is not None:
-            raise AgentError("observe came twice in a step; the order is observe, receive, act, and reset begins anew")
+        if self._observed is not None:
+            raise AgentError(
+                "observe was called twice in a step; call observe, receive, act in turn; reset starts over"
+            )
         given = dict(own or {})
         wanted = sorted(name.removeprefix("own.") for name in self._inputs if name.startswith("own."))
         if sorted(given) != wanted:
             raise AgentError(f"this agent reads {wanted} of its own data beside the observation, not {sorted(given)}")
         seen = {"observation": observation, **{f"own.{name}": value for name, value in given.items()}}
-        self._seen = {name: self._array(name, value) for name, value in seen.items()}
+        self._observed = {name: self._array(name, value) for name, value in seen.items()}
         return self._messages.copy()
 
     def receive(
@@ -101,45 +103,45 @@ class OnnxAgent:
         weight: ArrayLike | None = None,
         feature: ArrayLike | None = None,
     ) -> None:
-        """Take the messages that arrived in this step, in any order.
+        """Receive the messages that arrived in this step, in any order.
 
         Args:
             messages: what the neighbours returned from `observe`, [M, K, D] or a sequence of [K, D]; M may be zero.
-            weight: weights of the links that they came over [M].
-            feature: features of these links [M, F].
+            weight: weights of their edges [M].
+            feature: features of their edges [M, F].
 
         Raises:
-            AgentError: out of turn, or for data of another shape.
+            AgentError: called out of order, or data have the wrong shape.
         """
-        if self._seen is None:
-            raise AgentError("receive came before observe; the order is observe, receive, act")
-        if self._heard is not None:
-            raise AgentError("receive came twice in a step; give it all messages at once")
-        heard = {"inbox": self._array("inbox", messages)}
-        count = len(heard["inbox"])
+        if self._observed is None:
+            raise AgentError("receive was called before observe; the order is observe, receive, act")
+        if self._received is not None:
+            raise AgentError("receive was called twice in a step; pass all messages at once")
+        received = {"inbox": self._array("inbox", messages)}
+        count = len(received["inbox"])
         for name, value in (("weight", weight), ("feature", feature)):
             rows: ArrayLike | None = [] if value is None and count == 0 and name in self._inputs else value
             if (rows is not None) != (name in self._inputs):
                 need = "needs" if name in self._inputs else "was exported without"
-                raise AgentError(f"this agent {need} the {name} of links")
+                raise AgentError(f"this agent {need} an edge {name}")
             if rows is not None:
-                heard[name] = self._array(name, rows)
-                if len(heard[name]) != count:
-                    raise AgentError(f"{count} messages came with the {name} of {len(heard[name])} links")
-        self._heard = heard
+                received[name] = self._array(name, rows)
+                if len(received[name]) != count:
+                    raise AgentError(f"{count} messages came with the {name} of {len(received[name])} edges")
+        self._received = received
 
     def act(self) -> Array:
-        """End the step: return the action [O], and remember what to broadcast in the next step.
+        """End the step: return the action [O], and store the message to broadcast in the next step.
 
         Raises:
-            AgentError: out of turn.
+            AgentError: called out of order.
         """
-        if self._seen is None or self._heard is None:
-            missing = "observe" if self._seen is None else "receive, which takes [] where nothing was heard"
-            raise AgentError(f"act came before {missing}; the order is observe, receive, act")
-        feed = {**self._seen, "messages": self._messages, **self._heard}
+        if self._observed is None or self._received is None:
+            missing = "observe" if self._observed is None else "receive (pass [] if nothing arrived)"
+            raise AgentError(f"act was called before {missing}; the order is observe, receive, act")
+        feed = {**self._observed, "messages": self._messages, **self._received}
         action, self._messages = self._session.run(None, feed)
-        self._seen = self._heard = None
+        self._observed = self._received = None
         return action
 
     def _array(self, name: str, value: ArrayLike | Sequence[Array]) -> Array:
@@ -149,7 +151,7 @@ class OnnxAgent:
             array = np.array(value, dtype)
         except (TypeError, ValueError) as error:
             raise AgentError(f"{name} is {shape} of {dtype}, and cannot be made of what was given: {error}") from error
-        if array.shape == (0,):  # nothing, of whatever shape
+        if array.shape == (0,):  # an empty list
             array = array.reshape(0, *shape[1:])
         wanted = [*array.shape[:1], *shape[1:]] if shape[:1] == ["neighbours"] else shape
         if list(array.shape) != wanted:
@@ -158,7 +160,7 @@ class OnnxAgent:
 
 
 def open_session(model: bytes) -> ort.InferenceSession:
-    """Make an ONNX model ready to run in the calling thread: threads cost more than they gain at this size."""
+    """Load an ONNX model to run in the calling thread; more threads would be slower at this size."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])

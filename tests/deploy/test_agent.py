@@ -243,9 +243,9 @@ def test_an_agent_begins_with_nothing_and_may_reuse_its_buffers() -> None:
 
 
 def test_the_keys_of_a_policy_say_whether_links_have_weights() -> None:
-    assert Agent(policy()).links == EdgeData()
-    assert Agent(policy(edge_weight="weight")).links == EdgeData(weight=True)
-    with pytest.raises(InputError, match=r"say how many, as in links=EdgeData\(feature=2\)"):
+    assert Agent(policy()).edges == EdgeData()
+    assert Agent(policy(edge_weight="weight")).edges == EdgeData(weight=True)
+    with pytest.raises(InputError, match=r"give their number, as in edges=EdgeData\(feature=2\)"):
         Agent(policy(edge_feature="feature"))
 
 
@@ -272,14 +272,14 @@ def test_a_step_has_gradients() -> None:
 @pytest.mark.parametrize(
     ("calls", "sentence"),
     [
-        (["receive"], "receive came before observe"),
-        (["act"], "act came before observe"),
-        (["observe", "act"], r"act came before receive, which takes \[\]"),
-        (["observe", "observe"], "observe came twice"),
-        (["observe", "receive", "receive"], "receive came twice"),
-        (["observe", "receive", "observe"], "observe came twice"),
-        (["observe", "receive", "act", "act"], "act came before observe"),
-        (["observe", "receive", "reset", "act"], "act came before observe"),
+        (["receive"], "receive was called before observe"),
+        (["act"], "act was called before observe"),
+        (["observe", "act"], r"act was called before receive \(pass \[\]"),
+        (["observe", "observe"], "observe was called twice"),
+        (["observe", "receive", "receive"], "receive was called twice"),
+        (["observe", "receive", "observe"], "observe was called twice"),
+        (["observe", "receive", "act", "act"], "act was called before observe"),
+        (["observe", "receive", "reset", "act"], "act was called before observe"),
     ],
 )
 def test_calls_out_of_turn(calls: list[str], sentence: str) -> None:
@@ -320,9 +320,9 @@ MESSAGES = torch.zeros(3, 2, FEATURES)
         (EdgeData(), {"messages": MESSAGES[0]}, r"messages are \[M, 2, 6\], not \[2, 6\]"),
         (EdgeData(), {"messages": MESSAGES[:, :1]}, r"messages are \[M, 2, 6\], not \[3, 1, 6\]"),
         (EdgeData(), {"messages": [MESSAGES[0], MESSAGES[0, :1]]}, r"messages are \[2, 6\] each; one is \[1, 6\]"),
-        (EdgeData(), {"messages": MESSAGES, "weight": torch.ones(3)}, "was built without the weight of links"),
-        (EdgeData(weight=True), {"messages": MESSAGES}, "needs the weight of links"),
-        (EdgeData(weight=True), {"messages": MESSAGES, "weight": [1.0]}, r"weight of links are \[3\], not \[1\]"),
+        (EdgeData(), {"messages": MESSAGES, "weight": torch.ones(3)}, "was built without an edge weight"),
+        (EdgeData(weight=True), {"messages": MESSAGES}, "needs an edge weight"),
+        (EdgeData(weight=True), {"messages": MESSAGES, "weight": [1.0]}, r"edge weight are \[3\], not \[1\]"),
         (EdgeData(feature=2), {"messages": MESSAGES, "feature": torch.ones(3, 1)}, r"are \[3, 2\], not \[3, 1\]"),
     ],
 )
@@ -337,18 +337,18 @@ def test_wrong_messages(links: EdgeData, arguments: dict[str, Any], sentence: st
 def test_own_data_are_named() -> None:
     torch.manual_seed(0)
     agent = Agent(ModGNN(full_layer(1, None, FEATURES)))
-    wanted = r"read \['observation', 'sensors.battery'\] of the agent's own data, and got "
+    wanted = r"read \['observation', 'sensors.battery'\] of the agent's own data, but got "
     with pytest.raises(InputError, match=wanted + r"\['observation'\]"):
         agent.observe(torch.zeros(FEATURES))
     with pytest.raises(InputError, match=wanted + r"\['load', 'observation'\]"):
         agent.observe(torch.zeros(FEATURES), {"load": torch.zeros(1)})
     elsewhere = ModGNN(full_layer(1, None, FEATURES), own={"observation": "other"})
-    with pytest.raises(InputError, match=r"and got \['sensors.battery'\]"):
+    with pytest.raises(InputError, match=r"but got \['sensors.battery'\]"):
         Agent(elsewhere).observe(torch.zeros(FEATURES), {("sensors", "battery"): torch.zeros(1)})
 
 
 def test_what_no_agent_can_know_is_refused() -> None:
-    with pytest.raises(InputError, match="start='repeat', for which an agent would have to know"):
+    with pytest.raises(InputError, match="start='repeat', for which an agent would"):
         Agent(ModGNN([ModGNNLayer(1), ModGNNLayer(1, start="repeat")]))
     central = make_model("central", num_agents=AGENTS)
     with pytest.raises(InputError, match="layer 0 of this policy is a CentralLayer, which reads all agents at once"):

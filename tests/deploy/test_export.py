@@ -79,7 +79,7 @@ def everything() -> ModGNN:
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     folder, about = tmp_path_factory.mktemp("exports") / "agent", {"model": "everything", "control_frequency": 20.0}
-    return export_agent(everything(), folder, torch.zeros(FEATURES), own=OWN, links=LINKS, **about)  # type: ignore[arg-type]
+    return export_agent(everything(), folder, torch.zeros(FEATURES), own=OWN, edges=LINKS, **about)  # type: ignore[arg-type]
 
 
 class Heard:
@@ -258,19 +258,19 @@ SEEN: list[Any] = [np.zeros(FEATURES), {"sensors.battery": [0.0]}]
 @pytest.mark.parametrize(
     ("calls", "sentence"),
     [
-        ([("receive", [])], "receive came before observe"),
-        ([("act",)], "act came before observe"),
-        ([("observe", *SEEN), ("act",)], r"act came before receive, which takes \[\]"),
-        ([("observe", *SEEN), ("observe", *SEEN)], "observe came twice"),
-        ([("observe", *SEEN), ("receive", []), ("receive", [])], "receive came twice"),
-        ([("observe", *SEEN), ("receive", []), ("act",), ("act",)], "act came before observe"),
-        ([("observe", *SEEN), ("receive", []), ("reset",), ("act",)], "act came before observe"),
+        ([("receive", [])], "receive was called before observe"),
+        ([("act",)], "act was called before observe"),
+        ([("observe", *SEEN), ("act",)], r"act was called before receive \(pass \[\]"),
+        ([("observe", *SEEN), ("observe", *SEEN)], "observe was called twice"),
+        ([("observe", *SEEN), ("receive", []), ("receive", [])], "receive was called twice"),
+        ([("observe", *SEEN), ("receive", []), ("act",), ("act",)], "act was called before observe"),
+        ([("observe", *SEEN), ("receive", []), ("reset",), ("act",)], "act was called before observe"),
         ([("observe", np.zeros(5), SEEN[1])], r"observation is \[6\], not \[5\]"),
         ([("observe", "far", SEEN[1])], "observation is .* cannot be made of"),
         ([("observe", SEEN[0])], r"reads \['sensors.battery'\] of its own data beside the observation, not \[\]"),
         ([("observe", *SEEN), ("receive", [np.zeros((2, 10))])], r"inbox is \['neighbours', 2, 11\], not \[1, 2, 10\]"),
         ([("observe", *SEEN), ("receive", 5)], r"inbox is \['neighbours', 2, 11\], not \[\]"),
-        ([("observe", *SEEN), ("receive", [np.zeros((2, 11))])], "needs the weight of links"),
+        ([("observe", *SEEN), ("receive", [np.zeros((2, 11))])], "needs an edge weight"),
     ],
 )
 def test_a_misused_robot_says_so(exported: Exported, calls: list[tuple[Any, ...]], sentence: str) -> None:
@@ -285,7 +285,7 @@ def test_a_misused_robot_says_so(exported: Exported, calls: list[tuple[Any, ...]
 def test_as_much_must_be_known_of_links_as_there_are_messages(exported: Exported) -> None:
     robot = OnnxAgent(exported.folder)
     robot.observe(*SEEN)
-    with pytest.raises(AgentError, match="2 messages came with the weight of 1 links"):
+    with pytest.raises(AgentError, match="2 messages came with the weight of 1 edges"):
         robot.receive(np.zeros((2, 2, 11)), weight=[1.0], feature=np.zeros((2, 2)))
 
 
