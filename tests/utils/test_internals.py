@@ -8,8 +8,19 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from modgnn_rl import make_model
+from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.envs.flocking.task import training_env_factory
 from modgnn_rl.envs.parallel import parallel_flocks
-from modgnn_rl.utils.internals import has_hooks, is_functorch_active, parallel_env_processes, parse_hydra_flags
+from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
+from modgnn_rl.utils.internals import (
+    collector_carrier,
+    has_hooks,
+    is_functorch_active,
+    parallel_env_processes,
+    parse_hydra_flags,
+    set_collector_carrier,
+)
 
 
 def test_hydra_flags_have_the_fields_that_the_command_line_reads() -> None:
@@ -71,3 +82,16 @@ def test_a_running_transform_of_torch_func_is_seen() -> None:
     torch.func.vmap(function)(torch.ones(2, 3))
     torch.func.grad(function)(torch.ones(3))
     assert seen == [False, True, True]
+
+
+def test_what_a_collector_carries_is_the_next_observation_and_can_be_replaced() -> None:
+    """Else: rollouts do not resume where they were in `modgnn_rl.trainers.collectors.local`."""
+    make_env = training_env_factory(FlockingConfig())
+    policy = make_model("gcn", seed=0)
+    collector = LocalCollector(RolloutSpec(make_env, 2, 3, steps=2, seed=0), [policy])
+    rollouts = collector.collect()
+    carried = collector_carrier(collector.collector)
+    assert torch.equal(carried["agents", "observation"], rollouts["next", "agents", "observation"][:, -1])
+    set_collector_carrier(collector.collector, carried.clone())
+    assert collector_carrier(collector.collector) is not carried
+    collector.close()
