@@ -15,9 +15,9 @@ def main(config: CollectConfig) -> None:
         python -m modgnn_rl.collect env=paper env.compile=true threads=2
         python -m modgnn_rl.collect env.num_agents=16 output=datasets/small-flocks
     """
-    from modgnn_rl.data.collect import collect, report
+    from modgnn_rl.data.collect import collect_dataset, describe_dataset
 
-    print(report(collect(config)))
+    print(describe_dataset(collect_dataset(config)))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from datetime import datetime
 
 from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig
-from modgnn_rl.data.manifest import recordable
+from modgnn_rl.data.manifest import dataset_env_config
 from modgnn_rl.errors import InputError
 from modgnn_rl.reproduction.folder import claim_folder
 
@@ -26,7 +26,7 @@ def main(config: ReproduceConfig) -> int:
             f"env.num_agents={config.env.num_agents} must be {REFERENCE_SIZE}, as in the paper's training, and "
             f"scale.sizes={config.scale.sizes} must contain {REFERENCE_SIZE}; add further sizes to scale.sizes"
         )
-    recordable(config.env, config.scale.steps)
+    dataset_env_config(config.env, config.scale.steps)
     folder = claim_folder(config)
     from modgnn_rl.reproduction.jobs import run_jobs
     from modgnn_rl.reproduction.measurements import Results

@@ -43,7 +43,7 @@ def check_bc(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDict
             "trainer.dataset holds the labels of Reynolds flocking, not those of your expert; leave one out"
         )
     dataset = EpisodeDataset.open(settings.dataset)
-    dataset.check_world(config.env)
+    dataset.check_env_config(config.env)
     if dataset.episodes <= settings.num_val_envs:
         raise InputError(
             f"trainer.num_val_envs={settings.num_val_envs} leaves nothing to train on of the {dataset.episodes} "

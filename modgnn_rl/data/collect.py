@@ -21,8 +21,8 @@ from torch import Tensor
 
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
 from modgnn_rl.configs.settings import check
-from modgnn_rl.data.dataset import WITHOUT_EFFECT
-from modgnn_rl.data.manifest import LOCK, Manifest, check_shard, describe_shard, num_bytes, recordable
+from modgnn_rl.data.dataset import IRRELEVANT_SETTINGS
+from modgnn_rl.data.manifest import LOCK, Manifest, check_shard, dataset_env_config, describe_shard, num_bytes
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
@@ -31,13 +31,13 @@ from modgnn_rl.utils.folders import write_folder
 from modgnn_rl.utils.progress import Progress
 from modgnn_rl.utils.seeds import derive_seed
 
-__all__ = ["collect", "report", "rollout_expert"]
+__all__ = ["collect_dataset", "describe_dataset", "rollout_expert"]
 
 MARGIN = 2**24  # bytes to leave free on the disk
 LEFTOVER = re.compile(r"shard_\d{5,}\.(tmp|old)|\.manifest\.json\.\d+\.tmp")  # of a process that was killed
 
 
-def collect(config: CollectConfig) -> Path:
+def collect_dataset(config: CollectConfig) -> Path:
     """Roll out the expert and write a dataset, or its missing shards; see `modgnn_rl.data.manifest` for the files.
 
     Each shard has its own seed and is written atomically: after an interruption, the same settings lead to the same
@@ -52,7 +52,7 @@ def collect(config: CollectConfig) -> Path:
     check(config)
     prepare_torch(config.device, config.threads)
     wanted = Manifest(
-        env_config=recordable(config.env, config.steps or config.env.max_steps),
+        env_config=dataset_env_config(config.env, config.steps or config.env.max_steps),
         seed=config.seed,
         num_envs=config.num_envs,
         steps=config.steps or config.env.max_steps,
@@ -190,11 +190,13 @@ def _write_shard(path: Path, states: Tensor) -> None:
         TensorDict({"state": states}, states.shape[:2]).memmap(temporary)
 
 
-def report(folder: Path) -> str:
+def describe_dataset(folder: Path) -> str:
     """Location and size of a dataset, and the command that trains on it."""
     manifest = Manifest.read(folder)
     size = sum(map(num_bytes, manifest.shapes.values()))
-    default = {f"env.{name}": value for name, value in vars(FlockingConfig()).items() if name not in WITHOUT_EFFECT}
+    default = {
+        f"env.{name}": value for name, value in vars(FlockingConfig()).items() if name not in IRRELEVANT_SETTINGS
+    }
     changed = [
         f"{name}={_as_override(manifest.settings[name])}"
         for name in default

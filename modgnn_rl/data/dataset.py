@@ -1,4 +1,4 @@
-"""The expert's rollouts from a folder that ``python -m modgnn_rl.collect`` made.
+"""Expert episodes from a folder written by ``python -m modgnn_rl.collect``.
 
 Example::
 
@@ -29,10 +29,10 @@ from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.tensors import pair_distances
 
-__all__ = ["WITHOUT_EFFECT", "EpisodeDataset", "EpisodeWindows"]
+__all__ = ["IRRELEVANT_SETTINGS", "EpisodeDataset", "EpisodeWindows"]
 
-# Settings of a world that neither rollouts, nor graphs as matrices, nor the expert's actions depend on.
-WITHOUT_EFFECT = (
+# Settings on which neither episodes, nor dense graphs, nor the expert's actions depend.
+IRRELEVANT_SETTINGS = (
     "max_steps",
     "max_links",
     "compile",
@@ -44,18 +44,18 @@ WITHOUT_EFFECT = (
 
 
 class EpisodeDataset:
-    """Rollouts of flocks of one size in one world; open it with `open`.
+    """Expert episodes of one env config and flock size; see `open`.
 
     Attributes:
         path: the folder.
         manifest: its manifest.
-        env_config: the world of the rollouts.
-        episodes: number of rollouts, E.
-        steps: steps of each, T.
-        num_agents: agents in each, N.
-        shards: the rollouts, memory-mapped TensorDicts [E_k, T] that hold "state" [E_k, T, N, 6]: positions, m, and
-            velocities, m/s. Changes of them stay in this process.
-        device: where `windows` puts its result.
+        env_config: env config of the episodes.
+        episodes: number of episodes, E.
+        steps: steps per episode, T.
+        num_agents: agents in a flock, N.
+        shards: the episodes, memory-mapped TensorDicts [E_k, T] that hold "state" [E_k, T, N, 6]: positions, m, and
+            velocities, m/s. Changes to them stay in this process.
+        device: device of the tensors that `windows` returns.
     """
 
     def __init__(self, path: Path, manifest: Manifest, shards: list[TensorDict], device: torch.device | str) -> None:
@@ -69,22 +69,23 @@ class EpisodeDataset:
     def open(
         cls, path: str | os.PathLike[str], *, verify: bool = True, device: torch.device | str = "cpu"
     ) -> EpisodeDataset:
-        """Open a complete and undamaged dataset; nothing is loaded that could run code.
+        """Open a complete and undamaged dataset; nothing that is loaded can execute code.
 
         Args:
             path: its folder.
-            verify: compare the hashes of all files; one to three seconds for a gigabyte. Names and sizes always are.
-            device: where `windows` puts its result.
+            verify: compare the hashes of all files (one to three seconds per gigabyte); names and sizes are always
+                compared.
+            device: device of the tensors that `windows` returns.
 
         Raises:
-            InputError: it is no dataset, of another version, not complete, or damaged, or a file does not belong there.
+            InputError: it is not a dataset, of another version, incomplete, damaged, or contains other files.
         """
         path = Path(path)
         manifest = Manifest.read(path)
         if not manifest.is_complete:
             raise InputError(
-                f"{path} is not complete, it has {len(manifest.shards)} of {len(manifest.shapes)} shards; run the same "
-                "python -m modgnn_rl.collect again to complete it"
+                f"{path} is incomplete ({len(manifest.shards)} of {len(manifest.shapes)} shards); re-run the same "
+                "python -m modgnn_rl.collect to complete it"
             )
         if foreign := sorted(set(os.listdir(path)) - {MANIFEST, LOCK, *manifest.shapes}):
             raise InputError(f"{path / foreign[0]} does not belong to the dataset: move it elsewhere")
@@ -92,29 +93,29 @@ class EpisodeDataset:
         for name, shape in manifest.shapes.items():
             try:
                 check_shard(path / name, manifest.shards[name], shape, verify=verify)
-                # A private mapping: who changes what it shows does not change the file.
+                # A private mapping: changes to the tensor do not reach the file.
                 state = torch.from_file(str(path / name / STATE), shared=False, size=math.prod(shape))
             except (OSError, ValueError, RuntimeError) as error:
                 raise InputError(
-                    f"{path / name} is damaged ({error}): restore it, or run the same python -m modgnn_rl.collect again"
+                    f"{path / name} is damaged ({error}): restore it, or re-run the same python -m modgnn_rl.collect"
                 ) from error
             shards.append(TensorDict({"state": state.view(shape)}, shape[:2]))
         return cls(path, manifest, shards, device)
 
-    def check_world(self, env_config: FlockingConfig) -> None:
-        """Refuse to serve another world than the one of the rollouts.
+    def check_env_config(self, env_config: FlockingConfig) -> None:
+        """Check that an env config is that of the episodes.
 
         Raises:
-            InputError: with the settings that differ.
+            InputError: the settings that differ.
         """
-        wanted = {name: value for name, value in vars(env_config).items() if name not in WITHOUT_EFFECT}
+        wanted = {name: value for name, value in vars(env_config).items() if name not in IRRELEVANT_SETTINGS}
         size = as_list(wanted["num_agents"])
         wanted["num_agents"] = size[0] if len(size) == 1 else size
         different = self.manifest.differences({f"env.{name}": value for name, value in wanted.items()})
         if different:
             raise InputError(
-                f"the rollouts in {self.path} are of another world than env: {different}; set these as they are there, "
-                "or collect rollouts of this world"
+                f"the rollouts in {self.path} have another env config: {different}; use the same settings, or collect "
+                "rollouts with these"
             )
 
     def __len__(self) -> int:
@@ -124,7 +125,7 @@ class EpisodeDataset:
     def states(self, index: Tensor, length: int) -> Tensor:
         """Positions and velocities of the ``length`` steps up to each index, on the CPU.
 
-        Steps before the start of a rollout show its first state.
+        Steps before the start of an episode repeat its first state.
 
         Args:
             index: indices of flock states, int64 [S].
@@ -134,12 +135,13 @@ class EpisodeDataset:
             states [S, W, N, 6].
 
         Raises:
-            InputError: for an index that does not exist, or a length below 1.
+            InputError: an index is out of range, or the length is below 1.
         """
         index = index.cpu()
         if length < 1 or (len(index) and not 0 <= int(index.min()) <= int(index.max()) < len(self)):
             raise InputError(
-                f"windows of length {length} at indices {index.tolist()[:3]}... do not exist; lengths begin at 1, and "
+                f"windows of length {length} at indices {index.tolist()[:3]}... are out of range; lengths start at "
+                f"1, and "
                 f"indices are 0 to {len(self) - 1}"
             )
         episode, step = index // self.steps, self._steps(index, length).clamp(min=0)
@@ -151,10 +153,10 @@ class EpisodeDataset:
         return states
 
     def windows(self, index: Tensor, length: int) -> TensorDict:
-        """Windows of rollouts as `FlockingEnv` shows them, with the expert's actions.
+        """Windows of episodes with the keys of `FlockingEnv` and the expert's actions.
 
-        A window that begins before its rollout repeats the first state, and says each time that an episode begins
-        there, so that a policy has heard of nobody; a window of ``policy.window`` steps has exact actions at its end.
+        A window that starts before its episode repeats the first state with ``is_init`` set, so that a policy has no
+        messages there; a window of ``policy.window`` steps gives exact actions at its end.
 
         Args:
             index: index of the last state of each window, int64 [S], see ``len``.
@@ -174,7 +176,7 @@ class EpisodeDataset:
         return self._expert(windows)
 
     def _steps(self, index: Tensor, length: int) -> Tensor:
-        """The steps that windows show, [S, W]; those before the start of the rollout are negative."""
+        """Time steps of windows, [S, W]; negative before the start of the episode."""
         return (index % self.steps).unsqueeze(-1) + torch.arange(1 - length, 1, device=index.device)
 
     def buffer(
@@ -185,47 +187,46 @@ class EpisodeDataset:
         episodes: range | None = None,
         generator: torch.Generator | None = None,
     ) -> ReplayBuffer:
-        """A TorchRL replay buffer whose batches are windows with random ends, drawn with replacement.
+        """A TorchRL replay buffer of windows, sampled with replacement.
 
         Args:
             length: steps of each window.
             batch_size: windows in a batch.
-            episodes: rollouts to draw from, without gaps; default: all.
+            episodes: range of episodes to sample from; default: all.
             generator: source of randomness; default: torch's own.
         """
         return ReplayBuffer(
             storage=EpisodeWindows(self, length, range(self.episodes) if episodes is None else episodes, generator),
             sampler=RandomSampler(),
             writer=ImmutableDatasetWriter(),
-            collate_fn=_as_it_is,  # a batch is made whole
+            collate_fn=_identity,  # `get` returns a whole batch
             batch_size=batch_size,
             generator=generator,
         )
 
 
 class EpisodeWindows(Storage):
-    """Some rollouts of a dataset as a storage for TorchRL's replay buffers; item i is the window that ends at state i.
+    """Episodes of a dataset as a storage for TorchRL's replay buffers; item i is the window that ends at state i.
 
-    TorchRL's ``TensorStorage`` over the mapped states would serve single states. Windows reach over several of them,
-    back to the start of the rollout and no further, and graphs and labels are made for the states of a batch only:
-    stored they would take 50 times the space.
+    TorchRL's ``TensorStorage`` serves single states. Windows contain several, within one episode, and graphs and labels
+    are computed for each batch: stored, they would take 50 times the space.
 
     Args:
-        dataset: the rollouts.
+        dataset: the dataset.
         length: steps of each window.
-        episodes: the rollouts to serve, without gaps.
-        generator: draws the indices.
+        episodes: range of episodes to serve.
+        generator: source of randomness; its device is that of the indices.
 
     Raises:
-        InputError: the dataset does not have these rollouts.
+        InputError: the dataset does not contain these episodes.
     """
 
     def __init__(
         self, dataset: EpisodeDataset, length: int, episodes: range, generator: torch.Generator | None = None
     ) -> None:
         if not 0 <= episodes.start < episodes.stop <= dataset.episodes or episodes.step != 1:
-            raise InputError(f"{episodes} are not some of the {dataset.episodes} episodes of {dataset.path}")
-        # Not compilable ones would share a counter between processes, and start one of their own for that.
+            raise InputError(f"{episodes} is not a range of the {dataset.episodes} episodes of {dataset.path}")
+        # `compilable=False` would share a counter between processes, which starts an extra process.
         super().__init__(len(episodes) * dataset.steps, compilable=True)
         self.dataset, self.length, self.episodes = dataset, length, episodes
         self.device = None if generator is None else generator.device
@@ -241,5 +242,5 @@ class EpisodeWindows(Storage):
         return windows if index.ndim else windows[0]
 
 
-def _as_it_is(batch: TensorDictBase) -> TensorDictBase:
+def _identity(batch: TensorDictBase) -> TensorDictBase:
     return batch

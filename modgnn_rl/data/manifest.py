@@ -37,9 +37,9 @@ __all__ = [
     "STATE",
     "Manifest",
     "check_shard",
+    "dataset_env_config",
     "describe_shard",
     "num_bytes",
-    "recordable",
 ]
 
 DATASET_VERSION = 2  # 1: the environment's settings were under the key "world"
@@ -215,7 +215,7 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def recordable(env_config: FlockingConfig, steps: int) -> FlockingConfig:
+def dataset_env_config(env_config: FlockingConfig, steps: int) -> FlockingConfig:
     """The env config of a dataset of episodes with a number of steps.
 
     Raises:

@@ -19,7 +19,7 @@ from modgnn_rl.configs.schema import (
     ReproduceConfig,
     TrainConfig,
 )
-from modgnn_rl.data.collect import collect
+from modgnn_rl.data.collect import collect_dataset
 from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.reproduction.jobs import Job, Result
 from modgnn_rl.reproduction.measurements import (
@@ -202,7 +202,7 @@ def _collect(config: ReproduceConfig, folder: Path, done: Mapping[str, Result]) 
         device=config.device,
         threads=config.threads,
     )
-    collect(rollouts)
+    collect_dataset(rollouts)
     return {"episodes": rollouts.episodes}
 
 

@@ -1,6 +1,6 @@
-"""LoggerGroup: what TensorBoard, Weights & Biases and CSV files each make of a run, on TorchRL's loggers.
+"""Logger backends: TensorBoard, Weights & Biases and CSV files, on TorchRL's loggers.
 
-They may fail and may keep one waiting; `modgnn_rl.tracking.loggers.LoggerGroup` guards against both.
+They may fail or hang; `modgnn_rl.tracking.loggers.LoggerGroup` guards against both.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from modgnn_rl.configs.settings import flat
 from modgnn_rl.errors import one_line
 from modgnn_rl.tracking.run_folder import RunFolder
 
-__all__ = ["CsvFiles", "Dashboard", "Tensorboard", "Wandb"]
+__all__ = ["Backend", "CsvBackend", "TensorboardBackend", "WandbBackend"]
 
 References = Mapping[str, Mapping[str, float]]
 
 
-class Dashboard:
-    """What a run is shown on. What a kind of dashboard cannot show, it leaves out."""
+class Backend:
+    """A logger of a run; what a backend cannot show is left out."""
 
     logger: Any  # of torchrl.record
     shows_videos = False
@@ -38,13 +38,13 @@ class Dashboard:
         self.logger.log_metrics(dict(metrics), step=step)
 
     def log_histogram(self, step: int, name: str, values: NDArray[Any]) -> None:
-        """Log how numbers [n] are distributed."""
+        """Log a histogram of values [n]."""
 
     def log_video(self, step: int, name: str, path: Path) -> None:
         """Log a video, an mp4 file."""
 
     def log_table(self, name: str, columns: Sequence[str], rows: Sequence[Sequence[str | float]]) -> None:
-        """Show a table; later ones of that name replace it."""
+        """Log a table; a later one of the same name replaces it."""
 
     def log_references(self, step: int, references: References) -> None:
         """Draw horizontal lines up to this step into the charts of metrics.
@@ -55,17 +55,17 @@ class Dashboard:
         """
 
     def close(self) -> str:
-        """Finish, and return one line for the user that says where it all lies."""
+        """Close the logger and return one line that says where its files are."""
         self.logger.close()
         return f"{self.logger.exp_name}: {self.logger.experiment.log_dir}"
 
 
-class CsvFiles(Dashboard):
+class CsvBackend(Backend):
     """A file of steps and values for each metric, a file for each table, and one of the settings.
 
     Args:
         run: the run; the files lie in ``csv/`` there.
-        about: what it was made with, by name.
+        about: versions and commit, by name.
     """
 
     def __init__(self, run: RunFolder, about: Mapping[str, str]) -> None:
@@ -80,12 +80,12 @@ class CsvFiles(Dashboard):
             csv.writer(file).writerows([columns, *rows])
 
 
-class Tensorboard(Dashboard):
-    """TensorBoard. Each reference is a run of its own there, so that its lines are in the charts of the metrics.
+class TensorboardBackend(Backend):
+    """TensorBoard. Each reference is a separate TensorBoard run, so that its lines appear in the charts of the metrics.
 
     Args:
         run: the run; the files lie in ``tensorboard/`` there, and in a folder of it for each reference.
-        about: what it was made with, by name.
+        about: versions and commit, by name.
     """
 
     shows_videos = True
@@ -105,11 +105,11 @@ class Tensorboard(Dashboard):
         return self.logger.experiment
 
     def log_histogram(self, step: int, name: str, values: NDArray[Any]) -> None:
-        """Log how numbers [n] are distributed."""
+        """Log a histogram of values [n]."""
         self.logger.log_histogram(name, values, step=step, bins="tensorflow")
 
     def log_video(self, step: int, name: str, path: Path) -> None:
-        """Log a video among the images, as a GIF, the only video format that they can show."""
+        """Log a video among the images, as a GIF, the only video format that TensorBoard shows."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         from modgnn_rl.visualization.video import as_gif
@@ -119,7 +119,7 @@ class Tensorboard(Dashboard):
         self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=name, image=image)]), step)
 
     def log_table(self, name: str, columns: Sequence[str], rows: Sequence[Sequence[str | float]]) -> None:
-        """Show a table among the texts."""
+        """Log a table among the texts."""
         cells = [columns, ["---"] * len(columns), *rows]
         text = "\n".join("|".join(f"{x:.3g}" if isinstance(x, float) else str(x) for x in row) for row in cells)
         self._writer.add_text(name, text)
@@ -135,19 +135,19 @@ class Tensorboard(Dashboard):
                 self.references[name].add_scalar(metric, value, step)
 
     def close(self) -> str:
-        """Finish, and return one line for the user that says where it all lies."""
+        """Close the logger and return one line that says where its files are."""
         for writer in self.references.values():
             writer.close()
         super().close()
         return f"tensorboard --logdir {shlex.quote(self._writer.log_dir)}"
 
 
-class Wandb(Dashboard):
+class WandbBackend(Backend):
     """Weights & Biases; asks for no key, and goes offline where the server cannot be reached.
 
     Args:
         run: the run; the files lie in ``wandb/`` there.
-        about: what it was made with, by name.
+        about: versions and commit, by name.
         config: where to send it, and whether.
     """
 
@@ -201,7 +201,7 @@ class Wandb(Dashboard):
         )
 
     def log_histogram(self, step: int, name: str, values: NDArray[Any]) -> None:
-        """Log how numbers [n] are distributed."""
+        """Log a histogram of values [n]."""
         self.logger.log_histogram(name, values, step=step, bins=64)
 
     def log_video(self, step: int, name: str, path: Path) -> None:
@@ -211,7 +211,7 @@ class Wandb(Dashboard):
         self.logger.log_metrics({name: wandb.Video(str(path), format="mp4")}, step=step)
 
     def log_table(self, name: str, columns: Sequence[str], rows: Sequence[Sequence[str | float]]) -> None:
-        """Show a table; later ones of that name replace it."""
+        """Log a table; a later one of the same name replaces it."""
         import wandb
 
         self.logger.experiment.log({name: wandb.Table(columns=list(columns), data=[list(row) for row in rows])})

@@ -22,6 +22,7 @@ __all__ = [
     "parallel_env_processes",
     "parse_hydra_flags",
     "set_collector_carrier",
+    "wandb_process",
 ]
 
 
@@ -87,3 +88,15 @@ def collector_carrier(collector: Collector) -> TensorDictBase:
 def set_collector_carrier(collector: Collector, carrier: TensorDictBase) -> None:
     """Replace the data that a `Collector` carries to the next step [B]; see `collector_carrier`."""
     collector._carrier = carrier
+
+
+def wandb_process() -> Any:
+    """The helper process of Weights & Biases (a `subprocess.Popen`), or None if it is not running.
+
+    When it hangs, `wandb.finish` and `wandb.teardown` wait for it without end, and the interpreter waits for it at
+    exit. There is no public handle to end it.
+    """
+    from wandb.sdk import wandb_setup
+
+    helper = wandb_setup.singleton().assert_service()._proc
+    return None if helper is None else helper._process

@@ -19,7 +19,7 @@ from tensordict import TensorDict
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
 from modgnn_rl.data import collect as collect_module
 from modgnn_rl.data import manifest
-from modgnn_rl.data.collect import collect, report, rollout_expert
+from modgnn_rl.data.collect import collect_dataset, describe_dataset, rollout_expert
 from modgnn_rl.data.dataset import EpisodeDataset
 from modgnn_rl.data.manifest import LOCK, MANIFEST, STATE, Manifest
 from modgnn_rl.envs import FlockingEnv
@@ -40,12 +40,12 @@ def content(path: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    return content(collect(config(tmp_path_factory.mktemp("whole") / "set")))
+    return content(collect_dataset(config(tmp_path_factory.mktemp("whole") / "set")))
 
 
 def test_one_seed_fixes_the_flights_and_no_two_are_equal(tmp_path: Path, whole: dict[str, bytes]) -> None:
-    assert content(collect(config(tmp_path / "again"))) == whole
-    other = EpisodeDataset.open(collect(config(tmp_path / "other", seed=1)))
+    assert content(collect_dataset(config(tmp_path / "again"))) == whole
+    other = EpisodeDataset.open(collect_dataset(config(tmp_path / "other", seed=1)))
     states = torch.cat(
         [shard["state"] for data in (EpisodeDataset.open(tmp_path / "again"), other) for shard in data.shards]
     )
@@ -87,11 +87,11 @@ def test_what_was_stopped_goes_on_to_the_same_bits(
     with monkeypatch.context() as patch:
         patch.setattr(module, name, stopped)
         with pytest.raises(Killed):
-            collect(config(tmp_path / "set"))
+            collect_dataset(config(tmp_path / "set"))
     if (tmp_path / "set" / MANIFEST).exists():
-        with pytest.raises(InputError, match=r"is not complete, it has [012] of 3 shards; run the same"):
+        with pytest.raises(InputError, match=r"is incomplete \([012] of 3 shards\); re-run the same"):
             EpisodeDataset.open(tmp_path / "set")
-    assert content(collect(config(tmp_path / "set"))) == whole
+    assert content(collect_dataset(config(tmp_path / "set"))) == whole
     EpisodeDataset.open(tmp_path / "set")
 
 
@@ -99,7 +99,7 @@ def test_leftovers_of_a_killed_process_go(tmp_path: Path, whole: dict[str, bytes
     path = tmp_path / "set"
     (path / "shard_00001.tmp").mkdir(parents=True)
     (path / ".manifest.json.17.tmp").write_text("{")
-    assert content(collect(config(path))) == whole
+    assert content(collect_dataset(config(path))) == whole
 
 
 def test_ctrl_c_says_how_far_it_got(
@@ -114,15 +114,15 @@ def test_ctrl_c_says_how_far_it_got(
 
     monkeypatch.setattr(collect_module, "rollout_expert", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        collect(config(tmp_path / "set"))
+        collect_dataset(config(tmp_path / "set"))
     assert "has 2 of 3 shards; re-running the same command resumes there" in capsys.readouterr().err
 
 
 def test_a_finished_dataset_is_not_touched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    collect(config(tmp_path / "set"))
+    collect_dataset(config(tmp_path / "set"))
     before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")}
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 10, 0))
-    collect(config(tmp_path / "set"))
+    collect_dataset(config(tmp_path / "set"))
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")} == before
 
 
@@ -130,8 +130,8 @@ def test_a_finished_dataset_is_not_touched(tmp_path: Path, monkeypatch: pytest.M
 def test_more_episodes_are_added(
     tmp_path: Path, whole: dict[str, bytes], capsys: pytest.CaptureFixture[str], first: int
 ) -> None:
-    collect(config(tmp_path / "set", episodes=first))
-    assert content(collect(config(tmp_path / "set"))) == whole
+    collect_dataset(config(tmp_path / "set", episodes=first))
+    assert content(collect_dataset(config(tmp_path / "set"))) == whole
     assert "damaged" not in capsys.readouterr().err
 
 
@@ -147,9 +147,9 @@ def test_more_episodes_are_added(
 def test_damaged_shards_are_flown_again(
     tmp_path: Path, whole: dict[str, bytes], capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None]
 ) -> None:
-    path = collect(config(tmp_path / "set"))
+    path = collect_dataset(config(tmp_path / "set"))
     damage(path)
-    assert content(collect(config(path))) == whole
+    assert content(collect_dataset(config(path))) == whole
     assert "and is collected again" in capsys.readouterr().err
 
 
@@ -165,9 +165,9 @@ def test_damaged_shards_are_flown_again(
 def test_other_settings_are_refused(
     tmp_path: Path, whole: dict[str, bytes], others: dict[str, Any], message: str
 ) -> None:
-    path = collect(config(tmp_path / "set"))
+    path = collect_dataset(config(tmp_path / "set"))
     with pytest.raises(InputError, match=message):
-        collect(config(path, **others))
+        collect_dataset(config(path, **others))
     assert content(path) == whole
 
 
@@ -187,7 +187,7 @@ def test_other_settings_are_refused(
 def test_worlds_that_positions_do_not_tell_are_refused(tmp_path: Path, setting: str, value: Any) -> None:
     env_config = dataclasses.replace(WORLD, **{setting: value})
     with pytest.raises(InputError, match=f"env.{setting}="):
-        collect(config(tmp_path / "set", env=env_config))
+        collect_dataset(config(tmp_path / "set", env=env_config))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -203,10 +203,10 @@ def test_flights_do_not_depend_on_those_before(tmp_path: Path, env_config: dict[
     if "physics" in env_config:
         pytest.importorskip("pybullet")
     env_config = {"env": dataclasses.replace(WORLD, **env_config), "steps": 10, "episodes": 4}
-    one = collect(config(tmp_path / "one", **env_config))
-    other = collect(config(tmp_path / "other", **env_config))
+    one = collect_dataset(config(tmp_path / "one", **env_config))
+    other = collect_dataset(config(tmp_path / "other", **env_config))
     shutil.rmtree(other / "shard_00001")
-    assert content(collect(config(other, **env_config))) == content(one)
+    assert content(collect_dataset(config(other, **env_config))) == content(one)
 
 
 def test_nothing_ends_a_flight() -> None:
@@ -224,7 +224,7 @@ def test_nothing_ends_a_flight() -> None:
 def test_a_full_disk_is_refused_beforehand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 0, 5 * 10**6))
     with pytest.raises(InputError, match=r"dataset takes 23,040 MB and the disk of .* has 5 MB free; free some space"):
-        collect(config(tmp_path / "deep" / "set", episodes=30_000, steps=1000, env=FlockingConfig()))
+        collect_dataset(config(tmp_path / "deep" / "set", episodes=30_000, steps=1000, env=FlockingConfig()))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -232,21 +232,21 @@ def test_a_full_disk_is_refused_beforehand(tmp_path: Path, monkeypatch: pytest.M
 def test_a_file_in_the_way_is_one_sentence(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match=r"cannot write into .*give output="):
-        collect(config(tmp_path / name))
+        collect_dataset(config(tmp_path / name))
     assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_a_folder_of_other_things_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("mine")
     with pytest.raises(InputError, match="not a dataset of rollouts"):
-        collect(config(tmp_path))
+        collect_dataset(config(tmp_path))
     assert content(tmp_path) == {"mine": b"mine"}
 
 
 def test_two_processes_do_not_write_one_dataset(tmp_path: Path) -> None:
     with FileLock(tmp_path / LOCK), pytest.raises(InputError, match="another process is writing"):
-        collect(config(tmp_path))
-    collect(config(tmp_path))
+        collect_dataset(config(tmp_path))
+    collect_dataset(config(tmp_path))
 
 
 # The command
@@ -256,7 +256,7 @@ def test_the_report_ends_with_the_command_that_trains_in_the_same_world(tmp_path
     env_config = FlockingConfig(
         num_agents=4, separation_gain=0.7, leader_max_speed=float("inf"), start="grid", ground=-9.0
     )
-    text = report(collect(config(tmp_path / "my set", env=env_config)))
+    text = describe_dataset(collect_dataset(config(tmp_path / "my set", env=env_config)))
     assert "5 rollouts of 4 steps with 4 agents are in" in text
     assert text.endswith(
         f"python -m modgnn_rl.train trainer=bc 'trainer.dataset={tmp_path}/my set' env.num_agents=4 "

@@ -20,7 +20,7 @@ from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
-from modgnn_rl.data.collect import collect
+from modgnn_rl.data.collect import collect_dataset
 from modgnn_rl.data.dataset import EpisodeDataset
 from modgnn_rl.data.manifest import LOCK, MANIFEST, STATE
 from modgnn_rl.envs import FlockingEnv
@@ -35,7 +35,9 @@ EPISODES, STEPS, AT_ONCE = 5, 9, 2
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "set"
-    return collect(CollectConfig(env=WORLD, episodes=EPISODES, steps=STEPS, num_envs=AT_ONCE, seed=3, output=str(path)))
+    return collect_dataset(
+        CollectConfig(env=WORLD, episodes=EPISODES, steps=STEPS, num_envs=AT_ONCE, seed=3, output=str(path))
+    )
 
 
 @pytest.fixture
@@ -139,7 +141,7 @@ def test_equal_generators_draw_equal_batches(folder: Path) -> None:
 
 @pytest.mark.parametrize("episodes", [range(3, 6), range(0), range(-1, 2), range(0, 4, 2)])
 def test_episodes_that_do_not_exist_are_refused(folder: Path, episodes: range) -> None:
-    with pytest.raises(InputError, match="are not some of the 5 episodes"):
+    with pytest.raises(InputError, match="is not a range of the 5 episodes"):
         EpisodeDataset.open(folder).buffer(1, 8, episodes=episodes)
 
 
@@ -239,13 +241,13 @@ def test_without_verification_sizes_alone_are_compared(copy: Path) -> None:
 def test_another_world_is_refused_with_the_difference(folder: Path, setting: str, value: Any) -> None:
     env_config = FlockingConfig(**{**vars(WORLD), setting: value})
     with pytest.raises(InputError) as error:
-        EpisodeDataset.open(folder).check_world(env_config)
+        EpisodeDataset.open(folder).check_env_config(env_config)
     there = getattr(WORLD, setting)
-    assert f"of another world than env: env.{setting}={value} (there {there});" in str(error.value)
+    assert f"have another env config: env.{setting}={value} (there {there});" in str(error.value)
 
 
 def test_what_has_no_effect_may_differ(folder: Path) -> None:
     env_config = FlockingConfig(
         **{**vars(WORLD), "num_agents": [6], "max_steps": 7, "max_distance": 5.0, "compile": True}
     )
-    EpisodeDataset.open(folder).check_world(env_config)
+    EpisodeDataset.open(folder).check_env_config(env_config)

@@ -23,7 +23,7 @@ from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, 
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment import training
-from modgnn_rl.tracking.backends import Dashboard
+from modgnn_rl.tracking.backends import Backend
 from modgnn_rl.tracking.loggers import LoggerGroup, check_logger, make_logger
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
@@ -53,7 +53,7 @@ def clean_wandb(monkeypatch, tmp_path):
     wandb.teardown()
 
 
-class Fake(Dashboard):
+class Fake(Backend):
     """Fails, or takes its time, in the methods named."""
 
     shows_videos = True
@@ -116,7 +116,7 @@ def test_tensorboard_holds_everything_and_a_run_for_each_reference(run, tmp_path
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     loggers = make_logger(config("tensorboard"), run)
-    everything(LoggerGroup({"tensorboard": lambda: _without_film(loggers)}))
+    everything(LoggerGroup({"tensorboard": lambda: _without_videos(loggers)}))
     assert loggers.close() == [f"tensorboard --logdir {run.path}/tensorboard"]
     (own, expert) = (EventAccumulator(str(run.path / "tensorboard" / name)).Reload() for name in ("", "expert"))
     assert [(event.step, event.value) for event in own.Scalars("error")] == [(1, 0.5)]
@@ -131,14 +131,14 @@ def test_tensorboard_holds_everything_and_a_run_for_each_reference(run, tmp_path
     assert "made_with.torchrl|" in settings
 
 
-def _without_film(loggers):
-    """The first dashboard, but for films: there is none here to show."""
-    dashboard = next(iter(loggers._dashboards.values()))
-    dashboard.log_video = lambda *_: None
-    return dashboard
+def _without_videos(loggers):
+    """The first backend, without videos: there is none here to show."""
+    backend = next(iter(loggers._backends.values()))
+    backend.log_video = lambda *_: None
+    return backend
 
 
-def test_working_dashboards_are_passed_everything():
+def test_working_loggers_receive_everything():
     fakes = {"one": Fake(), "other": Fake()}
     loggers = LoggerGroup({name: lambda fake=fake: fake for name, fake in fakes.items()})
     everything(loggers)
@@ -166,7 +166,7 @@ def test_the_first_failure_turns_a_dashboard_off_with_one_warning_and_the_others
     with pytest.warns(RuntimeWarning) as caught:
         use()
     assert [str(warning.message) for warning in caught] == [
-        "logger=fake failed and is now off (the server); metrics.jsonl continues"
+        "logger=fake failed and is now off (the server); metrics.jsonl is still written"
     ]
     assert [name for name, *_ in fake.calls].count(broken) == 1
     assert len(other.calls) == 16
@@ -174,7 +174,7 @@ def test_the_first_failure_turns_a_dashboard_off_with_one_warning_and_the_others
 
 def test_a_dashboard_that_hangs_is_left_alone():
     fake = Fake("log", seconds=5.0)
-    loggers = LoggerGroup({"fake": lambda: fake}, patience=0.1)
+    loggers = LoggerGroup({"fake": lambda: fake}, timeout=0.1)
     began = time.monotonic()
     with pytest.warns(RuntimeWarning, match=r"off \(no answer within 0.1 s\)"):
         loggers.log(1, {"error": 0.5})
@@ -204,8 +204,8 @@ def test_ctrl_c_is_not_swallowed():
         ({"logger": "wandv"}, "did you mean 'wandb'"),
         ({"logger": ["csv", "wandv"]}, "did you mean 'wandb'"),
         ({"logger": None}, "logger=None is not one of none, csv"),
-        ({"logger": ["csv", "csv"]}, r"logger=\[csv,csv\] must name each dashboard once"),
-        ({"logger": ["none", "csv"]}, "none only by itself"),
+        ({"logger": ["csv", "csv"]}, r"logger=\[csv,csv\] must name each logger once"),
+        ({"logger": ["none", "csv"]}, "none only on its own"),
         ({"wandb": WandbConfig(mode="on")}, "not one of offline, online, disabled"),
         ({"wandb": WandbConfig(init_timeout=100.0)}, "at most 12"),
         ({"video_rounds": -1}, "at least 0"),
@@ -289,7 +289,7 @@ def test_wandb_holds_everything(run, tmp_path):
     for step, error in enumerate((0.5, math.nan, 0.25)):
         run.log(step, {"error": error})
     loggers = make_logger(config("wandb", group="mine"), run)
-    everything(LoggerGroup({"wandb": lambda: _without_film(loggers)}))
+    everything(LoggerGroup({"wandb": lambda: _without_videos(loggers)}))
     loggers = make_logger(config("wandb", group="mine"), run)
     assert loggers.shows_videos
     loggers.log_video(2, "rollout", film)
@@ -319,7 +319,7 @@ def wandb_helpers():
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
 @pytest.mark.usefixtures("clean_wandb")
 def test_wandb_without_its_helper_is_off_with_one_warning_and_does_not_harm_the_next_run(run, monkeypatch, sent):
-    monkeypatch.setattr("modgnn_rl.tracking.loggers.PATIENCE", 1.5)
+    monkeypatch.setattr("modgnn_rl.tracking.loggers.LOGGER_TIMEOUT", 1.5)
     logger = make_logger(config("wandb"), run)
     helpers = wandb_helpers()
     assert helpers

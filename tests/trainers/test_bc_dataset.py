@@ -17,7 +17,7 @@ from modgnn_rl.configs.schema import (
     ModelConfig,
     TrainConfig,
 )
-from modgnn_rl.data.collect import collect
+from modgnn_rl.data.collect import collect_dataset
 from modgnn_rl.data.dataset import EpisodeDataset, EpisodeWindows
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import train
@@ -32,7 +32,7 @@ EPISODES, STEPS = 6, 30
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "set"
-    return collect(CollectConfig(env=ENV, episodes=EPISODES, steps=STEPS, num_envs=4, output=str(path)))
+    return collect_dataset(CollectConfig(env=ENV, episodes=EPISODES, steps=STEPS, num_envs=4, output=str(path)))
 
 
 def run_bc(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
+import wandb
 from torch import Tensor, nn
 
 from modgnn_rl import make_model
@@ -20,6 +22,7 @@ from modgnn_rl.utils.internals import (
     parallel_env_processes,
     parse_hydra_flags,
     set_collector_carrier,
+    wandb_process,
 )
 
 
@@ -95,3 +98,16 @@ def test_what_a_collector_carries_is_the_next_observation_and_can_be_replaced() 
     set_collector_carrier(collector.collector, carried.clone())
     assert collector_carrier(collector.collector) is not carried
     collector.close()
+
+
+def test_wandb_has_a_process_that_can_be_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a helper process that hangs keeps a finished run from exiting."""
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    run = wandb.init(mode="offline", dir=tmp_path)
+    try:
+        process = wandb_process()
+        assert process.poll() is None
+    finally:
+        run.finish()
+        wandb.teardown()
+    assert process.wait(10) is not None

@@ -16,7 +16,7 @@ from modgnn_rl.evaluation.rollout import reference_policies, rollout
 from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.registry import METRICS
-from modgnn_rl.tracking.backends import Dashboard
+from modgnn_rl.tracking.backends import Backend
 from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop import dashboard_callback
@@ -24,7 +24,7 @@ from modgnn_rl.trainers.loop.dashboard_callback import DashboardCallback, log_ev
 from modgnn_rl.visualization import video
 
 
-class Recorder(Dashboard):
+class Recorder(Backend):
     """Keeps what it is shown."""
 
     shows_videos = True
