@@ -84,7 +84,7 @@ def test_the_seed_determines_a_run_and_checkpoints_keep_its_generators(tmp_path:
         ({"env": FlockingConfig(num_agents=5, separation_gain=0.7)}, r"env.separation_gain=0.7 \(there 0.8\)"),
         ({"env": FlockingConfig(num_agents=[5, 6])}, r"env.num_agents=\[5, 6\] \(there 5\)"),
         ({"num_val_envs": 6}, r"num_val_envs=6 leaves nothing to train on of the 6 episodes"),
-        ({"dataset": "nowhere"}, "nowhere is no dataset of rollouts"),
+        ({"dataset": "nowhere"}, "nowhere is not a dataset of rollouts"),
     ],
 )
 def test_a_dataset_that_does_not_fit_is_refused_before_a_run_is_created(
@@ -100,7 +100,7 @@ def test_a_damaged_dataset_is_refused_before_a_run_is_created(tmp_path: Path, da
     before = file.read_bytes()
     try:
         file.write_bytes(os.urandom(len(before)))
-        with pytest.raises(InputError, match=r"shard_00001 is damaged .state.memmap has changed"):
+        with pytest.raises(InputError, match=r"shard_00001 is damaged .the content of state.memmap has changed"):
             run_bc(tmp_path, dataset)
     finally:
         file.write_bytes(before)
