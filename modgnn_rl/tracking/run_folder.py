@@ -27,7 +27,7 @@ from modgnn_rl.utils.files import fsync_file, write_atomically
 
 __all__ = ["RUN_VERSION", "RunFolder"]
 
-RUN_VERSION = 1
+RUN_VERSION = 2  # 1: settings, metrics and the parts of checkpoints had other names
 LOCK_TIMEOUT = 0.5  # seconds; `is_locked` of another process holds the lock for a moment
 
 _HEADER = (

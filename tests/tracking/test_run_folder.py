@@ -26,7 +26,7 @@ def test_create_and_open_agree(tmp_path):
     assert RunFolder.open(made.path) == made
     text = (made.path / "config.yaml").read_text()
     assert text.startswith("#")
-    assert text.splitlines()[1] == "schema_version: 1"
+    assert text.splitlines()[1] == "schema_version: 2"
     assert text.endswith(CONFIG)
 
 
@@ -83,7 +83,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path, exists):
     ("text", "message"),
     [
         ("seed: 0\n", "schema_version None"),
-        ("schema_version: 2\n", "schema_version 2"),
+        ("schema_version: 1\n", "schema_version 1"),
         ("", "schema_version None"),
         ("- 1\n", "schema_version None"),
         ("a: [1\n", "cannot be read as YAML"),

@@ -170,7 +170,7 @@ def test_several_policies_are_listed_under_their_run(tmp_path):
     [
         ("config.yaml", "a: [", "config.yaml is damaged"),
         ("config.yaml", "3", "not the configuration of a run"),
-        ("config.yaml", "schema_version: 99\nenv: {}", "schema_version 99, this program reads 1"),
+        ("config.yaml", "schema_version: 99\nenv: {}", "schema_version 99, this program reads 2"),
         ("config.yaml", None, "no config.yaml"),
         ("evaluation.json", '{"8": {}}', "evaluation.json cannot be read"),
         ("evaluation.json", "{", "evaluation.json cannot be read"),

@@ -146,7 +146,7 @@ def test_two_rollouts_of_32_agents_and_1000_steps_take_less_than_a_megabyte(tmp_
 
 
 def test_invalid_settings_are_one_sentence(tmp_path):
-    (tmp_path / "config.yaml").write_text("schema_version: 1\n")
+    (tmp_path / "config.yaml").write_text("schema_version: 2\n")
     run = str(tmp_path)
     for config, words in (
         (ReplayConfig(run=str(tmp_path / "none")), "none"),
