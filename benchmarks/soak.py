@@ -216,7 +216,7 @@ def main() -> None:
         while time.monotonic() < until:
             soak.live(moments.expovariate(1 / options.pause))
             soak.fail()
-            print(f"{(until - time.monotonic()) / 60:.0f} min left, failures: {dict(soak.faults)}", flush=True)
+            print(f"{(until - time.monotonic()) / 60:.0f} min left, failures: {dict(soak.failures)}", flush=True)
         soak.live(60)
         soak.finish()
     finally:

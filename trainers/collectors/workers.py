@@ -232,8 +232,9 @@ class RayWorker:
         _start_ray(address)
         import ray
 
-        resources = {"num_cpus": 0 if address is None else 1, "num_gpus": 0.01 if torch.cuda.is_available() else 0}
-        self._actor = ray.remote(**resources)(WorkerCollector).remote()
+        num_cpus, num_gpus = 0 if address is None else 1, 0.01 if torch.cuda.is_available() else 0
+        actor: Any = ray.remote(WorkerCollector)
+        self._actor = actor.options(num_cpus=num_cpus, num_gpus=num_gpus).remote()
         self.pid: int | None = None
 
     def call(self, method: str, *arguments: bytes) -> None:
@@ -249,6 +250,9 @@ class RayWorker:
         try:
             value = pickle.loads(ray.get(self._answer, timeout=timeout))
         except GetTimeoutError as error:
+            if self.pid is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(self.pid, signal.SIGKILL)  # Ray waits for a process that was stopped
             self.kill()
             raise WorkerEndedError(f"no answer within {timeout:g} s") from error
         except RayTaskError as error:
@@ -263,9 +267,6 @@ class RayWorker:
         """End the actor at once."""
         import ray
 
-        if self.pid is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)  # Ray waits for a process that was stopped
         if ray.is_initialized():
             ray.kill(self._actor)
 

@@ -158,7 +158,7 @@ def test_error_says_how_to_install_ray(monkeypatch: pytest.MonkeyPatch) -> None:
         remote("ray")
 
 
-def collect_until_replaced(rollouts: RemoteCollector, process: int) -> TensorDictBase:
+def collect_until_replaced(rollouts: RemoteCollector, process: int | None) -> TensorDictBase:
     """The rollouts in which the second worker was replaced."""
     while True:
         collected = rollouts.collect()
@@ -247,7 +247,7 @@ def test_ray_and_other_physics_collect_the_same(name: str, physics: str) -> None
         rollouts.close()
 
 
-def is_running(process: int) -> bool:
+def is_running(process: int | None) -> bool:
     """Whether a process runs, which a zombie does not."""
     listing = subprocess.run(["ps", "-o", "stat=", "-p", str(process)], capture_output=True, text=True)
     return listing.stdout.strip()[:1] not in ("", "Z")
