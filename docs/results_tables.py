@@ -22,7 +22,7 @@ STAGES = {"cloned": "tables", "DAgger": "tables-after-dagger", "MAPPO": "tables-
 SHORT = (
     *("ModGNN-MLP, K = 1", "ModGNN-MLP, K = 2", "ModGNN-MLP, K = 3", "ModGNN-MLP [-f_mid], K = 1"),
     *("ModGNN-MLP [-f_pre], K = 1", "GCN [+f_final], K = 1", "GCN, K = 1", "Central"),
-    *("moment_force, K = 1", "pair_force, K = 1", "LocalReynolds(hops=1)", "zero action"),
+    *("moment_force, K = 1", "pair_force, K = 1", "local expert (1 hop)", "zero action"),
 )
 Rows = dict[str, dict[str, str]]
 
@@ -77,25 +77,27 @@ def claims() -> str:
 
 
 def verdict(row: Mapping[str, str]) -> str:
-    """What became of an ordering."""
+    """The verdict on an ordering, with its comparisons."""
     word = "**holds**" if row["here"] == "holds" else row["here"]
     away = f", {row['reversed']} reversed" if row["reversed"] != "0" else ""
     return f"{word} ({row['comparisons that hold']}{away})"
 
 
 VALIDATION = Column("validation", "table1", "mean", "paper")
-OWN_FLIGHTS = Column("own rollouts", "table2", "error", "error, paper")
+CLOSED_LOOP = Column("closed loop", "table2", "error", "error, paper")
 TABLES: dict[str, Callable[[], str]] = {
-    "errors": lambda: figures([VALIDATION, OWN_FLIGHTS]),
+    "errors": lambda: figures([VALIDATION, CLOSED_LOOP]),
     "sizes": lambda: figures([Column(f"{n} agents", "table3", f"N = {n}", f"N = {n}, paper") for n in (16, 64)]),
-    "rewards": lambda: figures([Column("reward", "table2_middle", "reward"), Column("lost", "table2", "lost")]),
+    "rewards": lambda: figures(
+        [Column("reward", "table2_iqm", "reward"), Column("leader lost", "table2", "leader lost")]
+    ),
     "claims": claims,
-    "short": lambda: figures([VALIDATION, OWN_FLIGHTS], SHORT),
+    "short": lambda: figures([VALIDATION, CLOSED_LOOP], SHORT),
 }
 
 
 def renewed(text: str) -> str:
-    """A page with its tables made anew."""
+    """A page with its tables regenerated."""
     return re.sub(
         r"(<!-- table (\w+) -->\n).*?(<!-- end -->)",
         lambda found: f"{found[1]}\n{TABLES[found[2]]()}\n\n{found[3]}",

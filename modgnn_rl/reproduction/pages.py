@@ -1,4 +1,4 @@
-"""The page of a study: the tables and figures that answer what is asked."""
+"""The page of a study: its tables and figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from modgnn_rl.reporting.report import Details, Figure, Section, gather_provenan
 from modgnn_rl.reporting.table import Table, as_csv, as_latex, as_markdown
 from modgnn_rl.reproduction.claims import claim_tables
 from modgnn_rl.reproduction.measurements import VALIDATION, Results
-from modgnn_rl.reproduction.paper_tables import REFERENCES, middle, name_of, paper_tables, shown, title_of
+from modgnn_rl.reproduction.paper_tables import REFERENCES, format_interval, iqm, name_of, paper_tables, title_of
 from modgnn_rl.reproduction.studies import HOPS, PERTURBATIONS, EvalSetting, ModelVariant, perturbation_name
 from modgnn_rl.utils.files import write_atomically
 
@@ -28,14 +28,14 @@ __all__ = ["QUESTIONS", "write_study"]
 
 QUESTIONS = {
     "tables": "The paper's tables",
-    "communication": "Which kind of communication f_com serves best?",
-    "layers": "What do layers and hops bring at equal numbers of parameters?",
+    "communication": "Which kind of communication f_com performs best?",
+    "layers": "What is the effect of layers and hops at equal numbers of parameters?",
     "range": "Which model is most robust to another communication range than the 3.5 m of training?",
-    "faults": "Which model is most robust to lost and late messages, noise and drop-outs?",
-    "size": "How does one set of weights, trained with 32 agents, fly flocks of other sizes?",
+    "faults": "Which model is most robust to packet loss, delay, noise and dropout?",
+    "size": "How does one set of weights, trained with 32 agents, perform in flocks of other sizes?",
 }
 STAGES = {
-    "cloning": "cloning of the expert's rollouts, as in the paper",
+    "cloning": "behaviour cloning of expert episodes, as in the paper",
     "dagger": "cloning, then DAgger",
     "mappo": "cloning, DAgger, then MAPPO",
 }
@@ -45,9 +45,9 @@ def write_study(results: Results, folder: Path, started: datetime | None = None)
     """Write the tables of a study, each as CSV and LaTeX and all on one page, and the report.
 
     Args:
-        results: what was measured.
-        folder: of the reproduction; the study has a folder of its own in it.
-        started: when this command began, with a time zone.
+        results: measurements of the study.
+        folder: folder of the reproduction; the study's own folder is inside it.
+        started: start time of the command, with a time zone.
 
     Returns:
         the path of ``report.html``; ``tables.md`` is beside it.
@@ -58,9 +58,9 @@ def write_study(results: Results, folder: Path, started: datetime | None = None)
     tables, figures, text = _tabled(results) if config.study == "tables" else _studied(results)
     failed = "\n\n".join(f"Failed: {line}." for line in outcome.failure_lines())
     title = f"{QUESTIONS[config.study]} ({config.scale.name}, {config.seeds} seed{'s' if config.seeds > 1 else ''})"
-    about = f"Policies made by {STAGES[config.after]}. {text}"
+    about = f"Policies trained by {STAGES[config.after]}. {text}"
     if config.scale.name == "smoke":
-        about += " At this scale hardly anything is learned: it shows that everything runs."
+        about += " At this scale hardly anything is learned; it only shows that everything runs."
     for name, table in tables.items():
         write_atomically(place / f"{name}.csv", as_csv(table))
         write_atomically(place / f"{name}.tex", as_latex(table))
@@ -68,11 +68,11 @@ def write_study(results: Results, folder: Path, started: datetime | None = None)
     write_atomically(place / "tables.md", "\n\n".join(filter(None, page)))
     times = "\n".join(f"{seconds:8.1f} s  {name}" for name, seconds in outcome.seconds.items())
     sections = [
-        *([Section("What failed", failed)] if failed else []),
+        *([Section("Failed jobs", failed)] if failed else []),
         Section("Results", about, [*figures, *tables.values()]),
-        Section("Settings", "", [Details("all settings", _yaml(config)), Details("time of each cell", times)]),
+        Section("Settings", "", [Details("all settings", _yaml(config)), Details("duration of each job", times)]),
     ]
-    spent = {"all cells": f"{sum(outcome.seconds.values()) / 60:.1f} min on one process"}
+    spent = {"all jobs": f"{sum(outcome.seconds.values()) / 60:.1f} min on one process"}
     return write_report(place, title, sections, gather_provenance(started=started, times=spent))
 
 
@@ -83,27 +83,27 @@ def _yaml(config: ReproduceConfig) -> str:
 def _tabled(results: Results) -> tuple[dict[str, Table], list[Figure], str]:
     """The paper's tables and claims."""
     tables = {**claim_tables(results), **paper_tables(results)}
-    order = ("claims", "margins", "table1", "table2", "table2_middle", "table3", "comparisons")
+    order = ("claims", "margins", "table1", "table2", "table2_iqm", "table3", "comparisons")
     figures = [
-        Figure("validation_error", _by_hops(results, VALIDATION), "Error on the expert's rollouts, m²/s²."),
-        Figure("error_in_flight", _by_hops(results, "N32"), "Error on rollouts of the models' own, m²/s²."),
+        Figure("validation_error", _by_hops(results, VALIDATION), "Validation error (expert episodes), m²/s²."),
+        Figure("closed_loop_error", _by_hops(results, "N32"), "Closed-loop error, m²/s²."),
     ]
-    return {name: tables[name] for name in order}, figures, "The figures of the paper stand beside those found here."
+    return {name: tables[name] for name in order}, figures, "The paper's values are beside those measured here."
 
 
-def _estimate(results: Results, row: ModelVariant | str, env_config: str) -> Estimate | None:
-    found = middle(results, row, env_config, "error")
+def _estimate(results: Results, row: ModelVariant | str, setting: str) -> Estimate | None:
+    found = iqm(results, row, setting, "error")
     return None if found is None or not np.isfinite(found.high) else Estimate(found.value, found.low, found.high)
 
 
-def _by_hops(results: Results, env_config: str) -> Callable[[Canvas], None]:
-    """Draws a row for each model, a marker for each number of hops (and layers), the references as lines."""
+def _by_hops(results: Results, setting: str) -> Callable[[Canvas], None]:
+    """Draw a row for each model, a marker for each number of hops (and layers), and the references as lines."""
     groups: dict[str, dict[str, Estimate]] = {}
     for variant in results.study.variants:
         layers = "" if variant.layers is None else f"L = {variant.layers}, "
-        if (estimate := _estimate(results, variant, env_config)) is not None:
+        if (estimate := _estimate(results, variant, setting)) is not None:
             groups.setdefault(f"{layers}K = {variant.hops}", {})[name_of(variant.model)] = estimate
-    lines = {name: _estimate(results, name, env_config) for name in REFERENCES[2:]}
+    lines = {name: _estimate(results, name, setting) for name in REFERENCES[2:]}
     references = {name: line.value for name, line in lines.items() if line is not None}
     return functools.partial(_draw_intervals, groups=groups, references=references)
 
@@ -117,34 +117,34 @@ def _studied(results: Results) -> tuple[dict[str, Table], list[Figure], str]:
     config, study = results.config, results.study
     name = config.study
     if name in ("communication", "layers"):
-        figures = [Figure(name, _by_hops(results, "study-32"), "Error on rollouts of the models' own, m²/s².")]
-        settings = {"expert's rollouts": VALIDATION, "own rollouts": "study-32"}
+        figures = [Figure(name, _by_hops(results, "study-32"), "Closed-loop error, m²/s².")]
+        settings = {"validation": VALIDATION, "closed loop": "study-32"}
     else:
         figures = (_curves_by_fault if name == "faults" else _curves_by_hops)(results)
-        settings = {_heading(env_config): env_config.name for env_config in study.settings}
-    usual = next(env_config.name for env_config in study.settings if _is_usual(config, env_config))
+        settings = {_heading(setting): setting.name for setting in study.settings}
+    usual = next(setting.name for setting in study.settings if _is_usual(config, setting))
     tables = {"errors": _errors(results, "Errors", settings, usual)}
     if name == "faults":
         tables = {f"errors_{fault}": table for fault, table in _errors_by_fault(results, usual)}
-    return {**tables, "lost": _lost(results, settings)}, figures, _answer(results, settings, usual)
+    return {**tables, "leader_lost": _leader_lost(results, settings)}, figures, _answer(results, settings, usual)
 
 
 def _errors_by_fault(results: Results, usual: str) -> Iterator[tuple[str, Table]]:
-    """A table for each fault, by its setting."""
+    """A table for each perturbation, by its setting."""
     for kind, levels in PERTURBATIONS.items():
-        settings = {"as trained": usual, **{f"{level:g}": perturbation_name(change) for level, change in levels}}
+        settings = {"training setting": usual, **{f"{level:g}": perturbation_name(change) for level, change in levels}}
         yield next(iter(levels[0][1])), _errors(results, f"Errors by {kind}", settings, usual)
 
 
-def _is_usual(config: ReproduceConfig, env_config: EvalSetting) -> bool:
-    same = all(getattr(config.env, name) == value for name, value in env_config.changes.items())
-    return same and (env_config.num_agents == REFERENCE_SIZE or config.study != "size")
+def _is_usual(config: ReproduceConfig, setting: EvalSetting) -> bool:
+    same = all(getattr(config.env, name) == value for name, value in setting.changes.items())
+    return same and (setting.num_agents == REFERENCE_SIZE or config.study != "size")
 
 
-def _heading(env_config: EvalSetting) -> str:
-    if env_config.name.startswith("size-"):
-        return f"N = {env_config.num_agents}"
-    return ", ".join(f"{name} {value}" for name, value in env_config.changes.items()) or "as trained"
+def _heading(setting: EvalSetting) -> str:
+    if setting.name.startswith("size-"):
+        return f"N = {setting.num_agents}"
+    return ", ".join(f"{name} {value}" for name, value in setting.changes.items()) or "training setting"
 
 
 def _rows(results: Results) -> list[ModelVariant | str]:
@@ -156,58 +156,67 @@ def _errors(results: Results, title: str, settings: Mapping[str, str], usual: st
     body: list[list[str | float]] = []
     for row in _rows(results):
         cells: list[str | float] = [
-            shown(middle(results, row, env_config, "error")) for env_config in settings.values()
+            format_interval(iqm(results, row, setting, "error")) for setting in settings.values()
         ]
         cells += [_rise(results, row, settings, usual)] if rises else []
         body.append([title_of(row), *cells])
-    caption = (
-        "Error against the expert's action, m²/s²: interquartile mean over seeds and rollouts with its 95 % interval."
-    )
+    caption = "Error [m²/s²]: interquartile mean (IQM) over seeds and episodes with its 95 % interval."
     if rises:
         caption += " Rise: mean over the other settings, minus the error in the training environment."
     best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(settings) + rises), "low")
-    header = ["model", *settings, *(["rise"] if rises else [])]
+    header = ["model", *settings, *(["increase"] if rises else [])]
     return Table(title, header, body, f"{caption} {_flown(results)}", best, REFERENCES)
 
 
 def _rise(results: Results, row: ModelVariant | str, settings: Mapping[str, str], usual: str) -> float:
-    found = {env_config: middle(results, row, env_config, "error") for env_config in {*settings.values(), usual}}
-    values = {env_config: np.nan if interval is None else interval.value for env_config, interval in found.items()}
-    return float(np.mean([value for env_config, value in values.items() if env_config != usual]) - values[usual])
+    found = {setting: iqm(results, row, setting, "error") for setting in dict.fromkeys([*settings.values(), usual])}
+    values = {setting: np.nan if interval is None else interval.value for setting, interval in found.items()}
+    return float(np.mean([value for setting, value in values.items() if setting != usual]) - values[usual])
 
 
 def _flown(results: Results) -> str:
-    flown = {(env_config.flocks, env_config.steps) for env_config in results.study.settings}
+    flown = {(setting.flocks, setting.steps) for setting in results.study.settings}
     rollouts = sorted({flocks for flocks, _ in flown})
     span = f"{rollouts[0]}" if len(rollouts) == 1 else f"{rollouts[0]} to {rollouts[-1]}"
-    return f"{span} rollouts of {results.study.settings[0].steps} steps from the same starts for all rows."
+    return f"{span} episodes of {results.study.settings[0].steps} steps from the same initial states for all rows."
 
 
-def _lost(results: Results, settings: Mapping[str, str]) -> Table:
-    flown = {heading: env_config for heading, env_config in settings.items() if env_config != VALIDATION}
+def _leader_lost(results: Results, settings: Mapping[str, str]) -> Table:
+    flown = {heading: setting for heading, setting in settings.items() if setting != VALIDATION}
     body = []
     for row in _rows(results):
-        shares = [results.values(row, env_config, "leader_lost") for env_config in flown.values()]
+        shares = [results.values(row, setting, "leader_lost") for setting in flown.values()]
         body.append([title_of(row), *("failed" if share is None else f"{share.mean():.0%}" for share in shares)])
     best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(flown)), "low")
-    return Table("Share of flocks that lost their leader", ["model", *flown], body, "At the end.", best, REFERENCES)
+    return Table(
+        "Leader lost",
+        ["model", *flown],
+        body,
+        "Fraction of episodes that end with the leader out of everyone's range.",
+        best,
+        REFERENCES,
+    )
 
 
 def _answer(results: Results, settings: Mapping[str, str], usual: str) -> str:
     """The best rows in words."""
     variants = results.study.variants
-    errors = {title_of(row): middle(results, row, usual, "error") for row in variants}
+    errors = {title_of(row): iqm(results, row, usual, "error") for row in variants}
     known = {title: interval.value for title, interval in errors.items() if interval is not None}
     if not known:
-        return "Nothing could be measured."
+        return "No measurement succeeded."
     text = f"Lowest error in the training environment: {min(known, key=known.__getitem__)}."
     rises = {title_of(row): _rise(results, row, settings, usual) for row in variants}
     others = {title: known[title] + rise for title, rise in rises.items() if title in known and np.isfinite(rise)}
     if len(settings) > 2 and others:
         text += f" Lowest mean error in the others: {min(others, key=others.__getitem__)}."
-        idle = middle(results, "zero action", usual, "error")
+        idle = iqm(results, "zero action", usual, "error")
         able = {title: rises[title] for title in others if idle is not None and known[title] < idle.value}
-        text += f" Least rise, of those better than doing nothing: {min(able, key=able.__getitem__)}." if able else ""
+        text += (
+            f" Smallest increase among those better than zero action: {min(able, key=able.__getitem__)}."
+            if able
+            else ""
+        )
     return f"{text} ModGNN-MLP's f_com is the Laplacian." if results.config.study == "communication" else text
 
 
@@ -216,8 +225,7 @@ def _curves_by_hops(results: Results) -> list[Figure]:
     study, is_size = results.study, results.config.study == "size"
     label = "agents" if is_size else "communication range, m"
     at = [
-        (env_config.num_agents if is_size else env_config.changes["comm_range"], env_config.name)
-        for env_config in study.settings
+        (setting.num_agents if is_size else setting.changes["comm_range"], setting.name) for setting in study.settings
     ]
     marks = {"trained": float(REFERENCE_SIZE) if is_size else results.config.env.comm_range}
     return [
@@ -231,19 +239,19 @@ def _curves_by_hops(results: Results) -> list[Figure]:
                 marks=marks,
                 log_x=is_size,
             ),
-            f"Error on rollouts of the models' own over {label}, K = {hops}; bands are 95 % intervals.",
+            f"Closed-loop error over {label}, K = {hops}; bands are 95 % intervals.",
         )
         for hops in HOPS
     ]
 
 
 def _curves_by_fault(results: Results) -> list[Figure]:
-    """A figure for each fault: errors of the models with K = 1 over its strength."""
+    """A figure for each perturbation: errors of the models with K = 1 over its strength."""
     figures = []
     for kind, levels in PERTURBATIONS.items():
         at = [(0.0, "study-32"), *((level, perturbation_name(change)) for level, change in levels)]
         draw = functools.partial(draw_curves, curves=_curves(results, 1, at), x_label=kind, y_label="error, m²/s²")
-        caption = f"Error on rollouts of the models' own over {kind}, K = 1; bands are 95 % intervals."
+        caption = f"Closed-loop error over {kind}, K = 1; bands are 95 % intervals."
         figures.append(Figure(f"faults_{next(iter(levels[0][1]))}", draw, caption))
     return figures
 
@@ -255,7 +263,7 @@ def _curves(results: Results, hops: int, at: Sequence[tuple[float, str]]) -> dic
     rows |= {name: name for name in ("local expert (1 hop)", "zero action")}
     curves, unknown = {}, Estimate(np.nan, np.nan, np.nan)
     for name, row in rows.items():
-        found = [_estimate(results, row, env_config) or unknown for _, env_config in at]
+        found = [_estimate(results, row, setting) or unknown for _, setting in at]
         value, low, high = ([getattr(one, end) for one in found] for end in ("value", "low", "high"))
         curves[name] = Curve([level for level, _ in at], value, low, high)
     return curves

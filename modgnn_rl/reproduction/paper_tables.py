@@ -1,4 +1,4 @@
-"""The paper's three tables with what was measured here beside the paper's figures."""
+"""The paper's three tables, its values beside those measured here."""
 
 from __future__ import annotations
 
@@ -16,7 +16,17 @@ from modgnn_rl.reporting.table import Table
 from modgnn_rl.reproduction.measurements import VALIDATION, Results
 from modgnn_rl.reproduction.studies import ModelVariant
 
-__all__ = ["REFERENCES", "mean", "middle", "name_of", "paper_tables", "published", "shown", "spread", "title_of"]
+__all__ = [
+    "REFERENCES",
+    "format_interval",
+    "iqm",
+    "mean",
+    "mean_and_std",
+    "name_of",
+    "paper_tables",
+    "published",
+    "title_of",
+]
 
 NAMES = {
     "modgnn_mlp": "ModGNN-MLP",
@@ -52,17 +62,17 @@ def title_of(row: Row) -> str:
 
 
 def name_of(model: str) -> str:
-    """What a model is called in tables: as in the paper, or as in settings."""
+    """The name of a model in tables: as in the paper, or as in settings."""
     return NAMES.get(model, model)
 
 
-def middle(results: Results, row: Row, env_config: str, figure: str) -> Interval | None:
-    """Interquartile mean of a figure over seeds and rollouts, with its 95 % interval; None where all failed."""
-    values = results.values(row, env_config, figure)
+def iqm(results: Results, row: Row, setting: str, metric: str) -> Interval | None:
+    """Interquartile mean of a metric over seeds and episodes, with its 95 % interval; None if all failed."""
+    values = results.values(row, setting, metric)
     return None if values is None else interquartile_interval(values, rng=np.random.default_rng(0))
 
 
-def shown(interval: Interval | None, digits: int = 3) -> str:
+def format_interval(interval: Interval | None, digits: int = 3) -> str:
     """An interquartile mean with its interval as text."""
     if interval is None:
         return "failed"
@@ -76,31 +86,33 @@ def paper_tables(results: Results) -> dict[str, Table]:
     return {
         "table1": _validation(results, rows),
         "table2": _evaluation(results, rows),
-        "table2_middle": _evaluation_middle(results, rows),
+        "table2_iqm": _evaluation_middle(results, rows),
         "table3": _generalization(results, rows),
     }
 
 
-def mean(results: Results, row: Row, env_config: str, figure: str) -> float:
-    """Mean of a figure over seeds and rollouts; NaN where all failed."""
-    values = results.values(row, env_config, figure)
+def mean(results: Results, row: Row, setting: str, metric: str) -> float:
+    """Mean of a metric over seeds and episodes; NaN if all failed."""
+    values = results.values(row, setting, metric)
     return math.nan if values is None else float(values.mean())
 
 
-def _about(results: Results, env_config: str) -> str:
-    """How many rollouts a table rests on."""
+def _about(results: Results, setting: str) -> str:
+    """The number of episodes and trainings behind a table."""
     seeds = results.config.seeds
     counted = (
-        f"{seeds} trainings of each model" if seeds > 1 else "one training of each model, so intervals tell of rollouts"
+        f"{seeds} trainings of each model"
+        if seeds > 1
+        else "one training of each model, so the intervals cover episodes only"
     )
-    if env_config == VALIDATION:
-        return f"{results.config.scale.val_episodes} rollouts of the expert that no model was trained on; {counted}."
-    flown = next(entry for entry in results.study.settings if entry.name == env_config)
-    return f"{flown.flocks} rollouts of {flown.steps} steps, from the same starts for all rows; {counted}."
+    if setting == VALIDATION:
+        return f"{results.config.scale.val_episodes} expert episodes that no model was trained on; {counted}."
+    flown = next(entry for entry in results.study.settings if entry.name == setting)
+    return f"{flown.flocks} episodes of {flown.steps} steps from the same initial states for all rows; {counted}."
 
 
 def _paper(row: Row, *keys: Any) -> Any:
-    """A figure of the paper, or None."""
+    """A value of the paper, or None."""
     entry: Any = published()
     for key in keys:
         entry = entry.get(key) if isinstance(entry, dict) else None
@@ -117,14 +129,14 @@ def _validation(results: Results, rows: Sequence[Row]) -> Table:
     for row in rows:
         model, hops = _hops(row)
         paper = _paper(row, "validation_loss", model, hops)
-        here = middle(results, row, VALIDATION, "error")
+        here = iqm(results, row, VALIDATION, "error")
         average = mean(results, row, VALIDATION, "error")
-        body.append([title_of(row), math.nan if paper is None else paper, average, shown(here)])
+        body.append([title_of(row), math.nan if paper is None else paper, average, format_interval(here)])
     caption = (
         "Mean squared error against the expert's action, per component, m²/s², on the expert's rollouts. Middle: "
-        f"interquartile mean with its 95 % interval over seeds and rollouts. {_about(results, VALIDATION)}"
+        f"interquartile mean with its 95 % interval over seeds and episodes. {_about(results, VALIDATION)}"
     )
-    header = ["model", "paper", "mean", "middle [95 %]"]
+    header = ["model", "paper", "mean", "IQM [95 %]"]
     return Table("Table 1: validation error", header, body, caption, {1: "low", 2: "low"}, REFERENCES)
 
 
@@ -137,74 +149,72 @@ def _evaluation(results: Results, rows: Sequence[Row]) -> Table:
         model, hops = _hops(row)
         paper = _paper(row, "model_evaluation", model, hops) or {}
         cells: list[Any] = [title_of(row), paper.get("error", math.nan), mean(results, row, "N32", "error")]
-        for figure in METRES:
-            there = paper.get(figure)
-            cells += ["-" if there is None else f"{there[0]:.2f} ± {there[1]:.2f}", _spread(results, row, figure)]
+        for metric in METRES:
+            there = paper.get(metric)
+            cells += ["-" if there is None else f"{there[0]:.2f} ± {there[1]:.2f}", _spread(results, row, metric)]
         body.append([*cells, _share(results, row, "leader_lost")])
     caption = (
-        "Rollouts of the models' own with 32 agents. Error: mean squared, against the expert's action, m²/s². Leader "
-        "distance, cohesion and separation: mean ± standard deviation over time, agents and rollouts, m. Lost: "
-        "share of "
-        f"flocks in which nobody hears the leader at the end. {_about(results, 'N32')}"
+        "Closed loop with 32 agents. Error: mean squared, against the expert's action, m²/s². Leader "
+        "distance, cohesion and separation: mean ± standard deviation over time, agents and episodes, m. Leader lost: "
+        f"fraction of episodes that end with the leader out of everyone's range. {_about(results, 'N32')}"
     )
     best: dict[int, Any] = {1: "low", 2: "low", 3: "low", 4: "low", 5: "low", 6: "low"}
-    return Table("Table 2: rollouts of the models' own", [*header, "lost"], body, caption, best, REFERENCES)
+    return Table("Table 2: closed loop", [*header, "leader lost"], body, caption, best, REFERENCES)
 
 
-def spread(results: Results, row: Row, figure: str) -> tuple[float, float]:
-    """Mean and standard deviation of a figure over time, agents, rollouts and seeds; NaN where all failed."""
-    values, squares = (results.values(row, "N32", name) for name in (figure, f"{figure}_square"))
+def mean_and_std(results: Results, row: Row, metric: str) -> tuple[float, float]:
+    """Mean and standard deviation of a metric over time, agents, episodes and seeds; NaN if all failed."""
+    values, squares = (results.values(row, "N32", name) for name in (metric, f"{metric}_square"))
     if values is None or squares is None:
         return math.nan, math.nan
     return float(values.mean()), math.sqrt(max(0.0, squares.mean() - values.mean() ** 2))
 
 
-def _spread(results: Results, row: Row, figure: str) -> str:
-    mean, deviation = spread(results, row, figure)
+def _spread(results: Results, row: Row, metric: str) -> str:
+    mean, deviation = mean_and_std(results, row, metric)
     return "failed" if math.isnan(mean) else f"{mean:.2f} ± {deviation:.2f}"
 
 
-def _share(results: Results, row: Row, figure: str) -> str:
-    values = results.values(row, "N32", figure)
+def _share(results: Results, row: Row, metric: str) -> str:
+    values = results.values(row, "N32", metric)
     return "failed" if values is None else f"{values.mean():.0%}"
 
 
 def _evaluation_middle(results: Results, rows: Sequence[Row]) -> Table:
-    figures = {"error": "error", **METRES, "separation_spread": "spread of separation", "reward": "reward"}
+    figures = {"error": "error", **METRES, "separation_spread": "std of separation", "reward": "reward"}
     body = [
         [
             title_of(row),
-            *(shown(middle(results, row, "N32", name), 3 if name == "error" else 2) for name in figures),
+            *(format_interval(iqm(results, row, "N32", name), 3 if name == "error" else 2) for name in figures),
         ]
         for row in rows
     ]
     caption = (
-        "The same rollouts: interquartile means over seeds and rollouts with their 95 % intervals. Spread of "
-        "separation: "
-        "its standard deviation over the time and agents of a rollout, m. Reward: of an agent, summed over the rollout."
+        "The same episodes: interquartile means over seeds and episodes with their 95 % intervals. Std of separation: "
+        "its standard deviation over the time and agents of an episode, m. Reward: per agent, summed over the episode."
     )
     best: dict[int, Any] = {1: "low", 2: "low", 3: "low", 5: "low", 6: "high"}
-    return Table("Table 2, middle of the rollouts", ["model", *figures.values()], body, caption, best, REFERENCES)
+    return Table("Table 2, interquartile means", ["model", *figures.values()], body, caption, best, REFERENCES)
 
 
 def _generalization(results: Results, rows: Sequence[Row]) -> Table:
-    settings = [env_config for env_config in results.study.settings if not env_config.changes]
+    settings = [setting for setting in results.study.settings if not setting.changes]
     header, body = ["model"], []
-    for env_config in settings:
-        header += [f"N = {env_config.num_agents}, paper", f"N = {env_config.num_agents}", "middle [95 %]"]
+    for setting in settings:
+        header += [f"N = {setting.num_agents}, paper", f"N = {setting.num_agents}", "IQM [95 %]"]
     for row in rows:
         model, hops = _hops(row)
         if model == "central":
             continue
         cells: list[Any] = [title_of(row)]
-        for env_config in settings:
-            paper = _paper(row, "generalization", model, hops, env_config.num_agents)
-            average = mean(results, row, env_config.name, "error")
-            here = middle(results, row, env_config.name, "error")
-            cells += [math.nan if paper is None else paper, average, shown(here)]
+        for setting in settings:
+            paper = _paper(row, "generalization", model, hops, setting.num_agents)
+            average = mean(results, row, setting.name, "error")
+            here = iqm(results, row, setting.name, "error")
+            cells += [math.nan if paper is None else paper, average, format_interval(here)]
         body.append(cells)
     caption = (
-        "Error on rollouts of the models' own with other numbers of agents than the 32 of training: mean, and "
+        "Closed-loop error with other numbers of agents than the 32 of training: mean, and "
         f"interquartile mean with its 95 % interval. {_about(results, settings[0].name)}"
     )
     best: dict[int, Any] = {

@@ -14,7 +14,7 @@ from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.reporting.table import as_csv
 from modgnn_rl.reproduce import main
-from modgnn_rl.reproduction.claims import CLAIMS, Claim, Operand, claim_tables, judge
+from modgnn_rl.reproduction.claims import CLAIMS, Claim, Operand, check_claim, claim_tables
 from modgnn_rl.reproduction.folder import claim_folder
 from modgnn_rl.reproduction.jobs import JobResults, run_jobs
 from modgnn_rl.reproduction.measurements import VALIDATION, Results
@@ -117,7 +117,7 @@ def test_page_tables_and_report_are_written(reproduction):
     page = write_study(Results(outcome, config, study), folder)
     text = page.with_name("tables.md").read_text()
     assert page.name == "report.html"
-    for name in ("Table 1", "Table 2", "Table 3", "What holds", "zero action", "Central", "0.267"):
+    for name in ("Table 1", "Table 2", "Table 3", "orderings", "zero action", "Central", "0.267"):
         assert name in text
     assert {"table1.csv", "table1.tex", "table3.csv", "claims.tex"} <= {file.name for file in page.parent.iterdir()}
 
@@ -188,11 +188,11 @@ class Paper:
 
 
 def test_every_claim_holds_of_the_papers_own_figures():
-    assert {judge(claim, Paper())[0] for claim in CLAIMS} == {"holds"}
+    assert {check_claim(claim, Paper())[0] for claim in CLAIMS} == {"holds"}
 
 
 def test_margins_of_the_papers_own_figures_are_those_in_its_text():
-    """At least 42 % in error; 25, 33 and 72 % in the spread of separation, which its rounded table gives as 32."""
+    """At least 42 % in error; 25, 33 and 72 % in the std of separation, which its rounded table gives as 32."""
     rows = claim_tables(Paper())["margins"].rows
     assert [row[1] for row in rows] == [row[2] for row in rows] == ["46% lower", "42% lower", "46% lower"]
     assert [row[3] for row in rows] == [row[4] for row in rows] == ["25% lower", "32% lower", "72% lower"]
@@ -208,7 +208,7 @@ def test_a_claim_is_reversed_undecided_or_not_measured():
 
     def word(*pairs):
         claim = Claim("", tuple((Operand(better, (1,)), Operand(worse, (1,))) for better, worse in pairs))
-        return judge(claim, Made())[0]
+        return check_claim(claim, Made())[0]
 
     assert word(("gcn", "no_mid")) == "holds"
     assert word(("no_mid", "gcn")) == "does not hold"
