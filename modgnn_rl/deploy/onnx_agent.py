@@ -181,7 +181,7 @@ def _load(folder: Path) -> tuple[dict[str, Any], bytes]:
     except (ValueError, KeyError, TypeError) as error:
         raise AgentError(f"{folder / 'agent.json'} is damaged; copy it again or export the policy again") from error
     if version != EXPORT_VERSION:
-        raise AgentError(f"{folder} was exported in version {version}, this program flies version {EXPORT_VERSION}")
+        raise AgentError(f"{folder} was exported in version {version}, this program runs version {EXPORT_VERSION}")
     if hashlib.sha256(model).hexdigest() != expected:
         raise AgentError(f"{file} is damaged: its SHA-256 is not the one in agent.json; copy it again or export again")
     return metadata, model

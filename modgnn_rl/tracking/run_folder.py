@@ -37,7 +37,7 @@ _HEADER = (
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run folder, made by :meth:`create` or found by :meth:`open`.
+    """A run folder; see `create` and `open`.
 
     It holds ``config.yaml``, ``metrics.jsonl``, ``status.json``, ``checkpoints/`` and whatever :meth:`write` adds.
 
@@ -59,7 +59,7 @@ class RunFolder:
             config_yaml: the resolved configuration.
 
         Raises:
-            InputError: the name is no name for a folder, or the root cannot be written; nothing is left behind.
+            InputError: the name is not a valid folder name, or the root cannot be written; nothing is left behind.
         """
         if not re.fullmatch(r"[A-Za-z0-9][\w.+-]*", name, re.ASCII):
             raise InputError(f"name={name!r} cannot name a folder: use letters, digits and _ . + - only")
@@ -82,7 +82,7 @@ class RunFolder:
 
     @staticmethod
     def check_root(root: str | os.PathLike[str]) -> None:
-        """Check that `create` could make folders in a root, without leaving anything.
+        """Check that `create` can make folders in a root; nothing is left behind.
 
         Raises:
             InputError: it could not.
@@ -113,14 +113,14 @@ class RunFolder:
         """Open the folder of an earlier run.
 
         Raises:
-            InputError: the folder does not exist, is no run folder, or its configuration cannot be read.
+            InputError: the folder does not exist, is not a run folder, or its configuration cannot be read.
         """
         path = Path(path).absolute()
         file = path / "config.yaml"
         if not file.is_file():
             raise InputError(
-                f"{path} is no run folder: expected config.yaml, metrics.jsonl and checkpoints/ as training makes; "
-                "give a folder such as runs/<date>-<name>"
+                f"{path} is not a run folder (config.yaml is missing): give a folder that training created, such as "
+                "runs/<date>-<name>"
             )
         return cls(path, _read_config(file))
 
@@ -131,7 +131,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep other processes from training in this folder; the lock ends with the process, however that ends.
+        """Keep other processes from training in this folder; the lock ends with the process.
 
         Raises:
             InputError: another process trains in it.
@@ -142,7 +142,7 @@ class RunFolder:
         except Timeout:
             raise InputError(
                 f"{self.path} is in use by a training run (process {self.status.get('pid', 'unknown')}): wait for it, "
-                "stop it, or begin a run of its own"
+                "stop it, or start another run"
             ) from None
         except OSError as error:
             raise InputError(f"cannot write into {self.path} ({error.strerror}): make the folder writable") from error
@@ -153,7 +153,7 @@ class RunFolder:
             lock.release()
 
     def _tidy(self) -> None:
-        """Remove what a training that was killed left half-written; others write no such files."""
+        """Remove the incomplete files of a training that was killed."""
         for pattern in (".status.json.*.tmp", ".config.yaml.*.tmp", "videos/.*.tmp.mp4"):
             for leftover in self.path.glob(pattern):
                 with contextlib.suppress(OSError):
@@ -172,7 +172,7 @@ class RunFolder:
 
     @property
     def status(self) -> dict[str, Any]:
-        """What `note_status` wrote; empty where there is nothing readable."""
+        """What `note_status` wrote; empty if there is nothing readable."""
         try:
             found = json.loads((self.path / "status.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -181,12 +181,12 @@ class RunFolder:
 
     @property
     def state(self) -> str:
-        """How the run stands: ``training``, ``evaluating``, ``finished``, ``stopped``, ``failed``, or ``killed``."""
+        """State of the run: ``training``, ``evaluating``, ``finished``, ``stopped``, ``failed``, or ``killed``."""
         state = str(self.status.get("state", "unknown"))
         return "killed" if state in ("training", "evaluating") and not self.is_locked else state
 
     def note_status(self, state: str, **figures: float | str) -> None:
-        """Write how the run stands into ``status.json``.
+        """Write the state of the run into ``status.json``.
 
         Args:
             state: ``training``, ``evaluating``, ``finished``, ``stopped`` (it can be resumed) or ``failed``.
@@ -209,7 +209,7 @@ class RunFolder:
 
     @property
     def best(self) -> Path:
-        """The folder for the best policy, a checkpoint that holds nothing else."""
+        """The folder for the best policy, a checkpoint of the policy alone."""
         return self.path / "best"
 
     @property
@@ -218,7 +218,7 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Append one line of JSON to ``metrics.jsonl``; it is in the file when this returns.
+        """Append one line of JSON to ``metrics.jsonl``; it has been written when this returns.
 
         Args:
             step: what the line is counted by.
@@ -241,14 +241,14 @@ class RunFolder:
                 raise
 
     def sync_metrics(self) -> int:
-        """Bring ``metrics.jsonl`` to the disk and return its size, bytes."""
+        """Synchronise ``metrics.jsonl`` to disk and return its size (bytes)."""
         if not self.metrics_file.exists():
             return 0
         fsync_file(self.metrics_file)
         return self.metrics_file.stat().st_size
 
     def cut_metrics(self, size: int) -> None:
-        """Take back what was appended to ``metrics.jsonl`` beyond a size, bytes.
+        """Truncate ``metrics.jsonl`` to a size (bytes).
 
         Raises:
             ValueError: it is shorter than that.
@@ -260,7 +260,7 @@ class RunFolder:
             os.truncate(self.metrics_file, size)
 
     def read_metrics(self) -> list[dict[str, float]]:
-        """Return the lines of ``metrics.jsonl``; ``null`` comes back as NaN, a line cut by a crash is left out."""
+        """Return the lines of ``metrics.jsonl``; ``null`` comes back as NaN, an incomplete last line is skipped."""
         records = []
         text = self.metrics_file.read_text(encoding="utf-8", errors="replace") if self.metrics_file.exists() else ""
         for number, line in enumerate(text.splitlines(), start=1):
@@ -272,7 +272,7 @@ class RunFolder:
         return records
 
     def write(self, name: str, text: str) -> Path:
-        """Write a text file into the folder, whole or not at all, and return its path."""
+        """Write a text file into the folder atomically, and return its path."""
         write_atomically(self.path / name, text)
         return self.path / name
 
@@ -282,7 +282,7 @@ def _unwritable(root: Path, error: OSError) -> InputError:
 
 
 def _make_unique(path: Path) -> Path:
-    """Make a new folder called `path`, or `path-2`, `path-3` and so on where it exists."""
+    """Make a new folder `path`, or `path-2`, `path-3` and so on if it exists."""
     number, candidate = 1, path
     while True:
         try:
@@ -306,6 +306,6 @@ def _read_config(file: Path) -> dict[str, Any]:
     version = config.pop("schema_version", None) if isinstance(config, dict) else None
     if version != RUN_VERSION or not isinstance(config, dict):
         raise InputError(
-            f"{file} has schema_version {version}, this program reads {RUN_VERSION}: use the one that made the run"
+            f"{file} has schema_version {version}, this program reads {RUN_VERSION}: use the version that made the run"
         )
     return {str(key): value for key, value in config.items()}

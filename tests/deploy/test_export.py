@@ -225,7 +225,7 @@ def test_other_damage_is_one_sentence_too(copied: Path) -> None:
     with pytest.raises(AgentError, match=r"agent\.json does not describe agent\.onnx"):
         OnnxAgent(copied)
     change(about, lambda content: content.update(schema_version=2))
-    with pytest.raises(AgentError, match="exported in version 2, this program flies version 1"):
+    with pytest.raises(AgentError, match="exported in version 2, this program runs version 1"):
         OnnxAgent(copied)
     about.unlink()
     with pytest.raises(AgentError, match="holds no exported agent"):
@@ -332,7 +332,7 @@ def test_a_policy_that_would_not_fly_alone(policy: ModGNN, dtype: torch.dtype, s
 def test_a_folder_of_something_else_stays(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("all of it")
     for target in (tmp_path, tmp_path / "thesis.tex"):
-        with pytest.raises(InputError, match="holds something that is no exported agent"):
+        with pytest.raises(InputError, match="contains something other than an exported agent"):
             export_agent(with_final(nn.Identity()), target, torch.zeros(3))
     assert (tmp_path / "thesis.tex").read_text() == "all of it"
 
@@ -434,4 +434,4 @@ def test_a_folder_that_is_no_run_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command(monkeypatch, f"run={tmp_path}") == 2
-    assert "is no run folder" in capsys.readouterr().err
+    assert "is not a run folder" in capsys.readouterr().err

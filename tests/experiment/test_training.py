@@ -216,10 +216,10 @@ def test_an_invalid_setting_that_training_finds_is_one_line_and_leaves_nothing(
     ("command", "argument", "words"),
     [
         ("train", "runs=file/runs", "cannot write into"),
-        ("train", "resume=nowhere", "is no run folder"),
-        ("train", "init_from=.", "is no run folder"),
-        ("evaluate", "run=nowhere", "is no run folder"),
-        ("export", "run=nowhere", "is no run folder"),
+        ("train", "resume=nowhere", "is not a run folder"),
+        ("train", "init_from=.", "is not a run folder"),
+        ("evaluate", "run=nowhere", "is not a run folder"),
+        ("export", "run=nowhere", "is not a run folder"),
     ],
 )
 def test_an_unusable_folder_is_reported_before_torch_is_imported(tmp_path, command, argument, words):

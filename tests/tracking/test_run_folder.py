@@ -75,7 +75,7 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch, root_exists):
 
 @pytest.mark.parametrize("exists", [True, False])
 def test_a_folder_that_is_no_run_is_refused(tmp_path, exists):
-    with pytest.raises(InputError, match=r"no run folder: expected config\.yaml"):
+    with pytest.raises(InputError, match=r"not a run folder \(config\.yaml is missing\)"):
         RunFolder.open(tmp_path if exists else tmp_path / "none")
 
 

@@ -131,8 +131,8 @@ def test_it_trains_in_every_environment(tmp_path, env, model, mappo_config):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"init_from": "."}, "is no run folder"),
-        ({"init_from": "nowhere"}, "is no run folder"),
+        ({"init_from": "."}, "is not a run folder"),
+        ({"init_from": "nowhere"}, "is not a run folder"),
         ({"model": ModelConfig(name="gcn")}, r"name='gcn'.* is not that of init_from=.*name='modgnn_mlp', hops=2"),
         ({"trainer": BCConfig(seeds=2)}, "several policies cannot all start from that of init_from"),
         ({"trainer": BCConfig(models=["gcn"])}, "trainer.models and trainer.hops name new policies"),
