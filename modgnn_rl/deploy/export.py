@@ -257,7 +257,7 @@ def _metadata(policy: ModGNN, module: _Step, inputs: Inputs, models: Mapping[str
 def _check_folder(folder: Path) -> None:
     is_ours = (folder / "agent.json").is_file() or (folder.is_dir() and not any(folder.iterdir()))
     if folder.exists() and not is_ours:
-        raise InputError(f"{folder} contains something other than an exported agent; give a folder that does not exist yet")
+        raise InputError(f"{folder} is not an exported agent; give a folder that does not exist yet")
 
 
 def write_agent(folder: Path, files: Mapping[str, bytes]) -> None:

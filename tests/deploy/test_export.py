@@ -332,7 +332,7 @@ def test_a_policy_that_would_not_fly_alone(policy: ModGNN, dtype: torch.dtype, s
 def test_a_folder_of_something_else_stays(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("all of it")
     for target in (tmp_path, tmp_path / "thesis.tex"):
-        with pytest.raises(InputError, match="contains something other than an exported agent"):
+        with pytest.raises(InputError, match="is not an exported agent"):
             export_agent(with_final(nn.Identity()), target, torch.zeros(3))
     assert (tmp_path / "thesis.tex").read_text() == "all of it"
 
