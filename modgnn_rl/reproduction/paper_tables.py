@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 
 from modgnn_rl.evaluation.statistics import Interval, interquartile_interval
+from modgnn_rl.registry import METRICS
 from modgnn_rl.reporting.table import Table
 from modgnn_rl.reproduction.measurements import VALIDATION, Results
 from modgnn_rl.reproduction.studies import ModelVariant
@@ -22,6 +23,7 @@ __all__ = [
     "iqm",
     "mean",
     "mean_and_std",
+    "metric_title",
     "name_of",
     "paper_tables",
     "published",
@@ -40,7 +42,7 @@ NAMES = {
     "mpnn": "message passing",
 }
 REFERENCES = ("expert", "local expert (2 hops)", "local expert (1 hop)", "zero action")
-METRES = {"leader_distance": "leader distance", "cohesion": "cohesion", "separation": "separation"}
+DISTANCES = ("leader_distance", "cohesion", "separation")  # metrics of the paper, m
 Row = ModelVariant | str
 
 
@@ -64,6 +66,13 @@ def title_of(row: Row) -> str:
 def name_of(model: str) -> str:
     """The name of a model in tables: as in the paper, or as in settings."""
     return NAMES.get(model, model)
+
+
+def metric_title(metric: str) -> str:
+    """The title of a metric, or of its standard deviation over time and agents (``<metric>_spread``)."""
+    name = metric.removesuffix("_spread")
+    title = str(METRICS[name].options["title"])
+    return title if name == metric else f"std of {title}"
 
 
 def iqm(results: Results, row: Row, setting: str, metric: str) -> Interval | None:
@@ -142,14 +151,14 @@ def _validation(results: Results, rows: Sequence[Row]) -> Table:
 
 def _evaluation(results: Results, rows: Sequence[Row]) -> Table:
     header = ["model", "error, paper", "error"]
-    for name in METRES.values():
-        header += [f"{name}, paper", name]
+    for metric in DISTANCES:
+        header += [f"{metric_title(metric)}, paper", metric_title(metric)]
     body = []
     for row in rows:
         model, hops = _hops(row)
         paper = _paper(row, "model_evaluation", model, hops) or {}
         cells: list[Any] = [title_of(row), paper.get("error", math.nan), mean(results, row, "N32", "error")]
-        for metric in METRES:
+        for metric in DISTANCES:
             there = paper.get(metric)
             cells += ["-" if there is None else f"{there[0]:.2f} ± {there[1]:.2f}", _spread(results, row, metric)]
         body.append([*cells, _share(results, row, "leader_lost")])
@@ -181,11 +190,11 @@ def _share(results: Results, row: Row, metric: str) -> str:
 
 
 def _evaluation_middle(results: Results, rows: Sequence[Row]) -> Table:
-    figures = {"error": "error", **METRES, "separation_spread": "std of separation", "reward": "reward"}
+    metrics = ("error", *DISTANCES, "separation_spread", "reward")
     body = [
         [
             title_of(row),
-            *(format_interval(iqm(results, row, "N32", name), 3 if name == "error" else 2) for name in figures),
+            *(format_interval(iqm(results, row, "N32", name), 3 if name == "error" else 2) for name in metrics),
         ]
         for row in rows
     ]
@@ -194,7 +203,9 @@ def _evaluation_middle(results: Results, rows: Sequence[Row]) -> Table:
         "its standard deviation over the time and agents of an episode, m. Reward: per agent, summed over the episode."
     )
     best: dict[int, Any] = {1: "low", 2: "low", 3: "low", 5: "low", 6: "high"}
-    return Table("Table 2, interquartile means", ["model", *figures.values()], body, caption, best, REFERENCES)
+    return Table(
+        "Table 2, interquartile means", ["model", *map(metric_title, metrics)], body, caption, best, REFERENCES
+    )
 
 
 def _generalization(results: Results, rows: Sequence[Row]) -> Table:
