@@ -150,5 +150,8 @@ EnvOverrides = make_dataclass(
         for entry in fields(FlockingConfig)
         if entry.name not in ("num_agents", "max_steps")  # settings of the evaluation itself
     ],
-    namespace={"__doc__": "Changes to the environment of the training run; null: as in training."},
+    namespace={
+        "__module__": __name__,
+        "__doc__": "Changes to the environment of the training run; null: as in training.",
+    },
 )
