@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass
 from typing import Any
 
-from modgnn_rl.configs.settings import as_list, setting
+from modgnn_rl.configs.settings import setting
+from modgnn_rl.configs.task import TaskConfig
+from modgnn_rl.registry import TASKS
 
-__all__ = ["REFERENCE_SIZE", "EnvOverrides", "FlockingConfig"]
+__all__ = ["REFERENCE_SIZE", "FlockingConfig"]
 
 REFERENCE_SIZE = 32  # the flock size to which start_radius, num_envs and agents_per_state refer
 
 
 @dataclass
-class FlockingConfig:
+class FlockingConfig(TaskConfig):
     """The environment: flocks of quadcopters that follow a leader, and the gains of their Reynolds expert.
 
     The defaults are ``env=flocking``, in which the expert keeps flocks together; ``env=paper`` is closest to the paper.
     """
 
+    name: str = setting("flocking", "task", choices=TASKS)
     num_agents: Any = setting(
         32, "agents in a flock, including the leader; a list trains on several sizes at once", ge=1, whole=True
     )
@@ -128,11 +131,6 @@ class FlockingConfig:
     )
 
     @property
-    def sizes(self) -> list[int]:
-        """``num_agents`` as a list."""
-        return as_list(self.num_agents)
-
-    @property
     def hides_state(self) -> bool:
         """Whether observations differ from the true state, through delay or noise."""
         return self.delay > 0 or self.position_noise > 0 or self.velocity_noise > 0
@@ -141,17 +139,3 @@ class FlockingConfig:
     def state_key(self) -> tuple[str, str]:
         """Key of the true positions and velocities."""
         return ("agents", "state" if self.hides_state else "observation")
-
-
-EnvOverrides = make_dataclass(
-    "EnvOverrides",
-    [
-        (entry.name, Any, field(default=None, metadata=entry.metadata))
-        for entry in fields(FlockingConfig)
-        if entry.name not in ("num_agents", "max_steps")  # settings of the evaluation itself
-    ],
-    namespace={
-        "__module__": __name__,
-        "__doc__": "Changes to the environment of the training run; null: as in training.",
-    },
-)

@@ -11,10 +11,11 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from modgnn_rl.configs.flocking import REFERENCE_SIZE, EnvOverrides, FlockingConfig
-from modgnn_rl.configs.settings import as_list, group, setting
+from modgnn_rl.configs.flocking import REFERENCE_SIZE, FlockingConfig
+from modgnn_rl.configs.settings import as_list, group, overrides_of, setting
+from modgnn_rl.configs.task import TaskConfig
 from modgnn_rl.configs.trainers import BCConfig, DAggerConfig, ImitationConfig, MAPPOConfig, TrainerConfig
-from modgnn_rl.registry import MODELS, TRAINERS
+from modgnn_rl.registry import MODELS, TASKS, TRAINERS
 
 __all__ = [
     "REFERENCE_SIZE",
@@ -34,6 +35,7 @@ __all__ = [
     "ReproduceConfig",
     "RunsConfig",
     "ScaleConfig",
+    "TaskConfig",
     "TrainConfig",
     "TrainerConfig",
     "WandbConfig",
@@ -42,6 +44,7 @@ __all__ = [
 
 DEVICE_HELP = "torch device: cpu, cuda, cuda:1"
 THREADS_HELP = "CPU threads of torch; more than one rarely helps at these sizes; 0: one per core"
+EnvOverrides = overrides_of(FlockingConfig)  # a command replaces it by that of the run's task
 CHECKPOINT_HELP = "policy to load: the last one, or the best one seen during training"
 
 
@@ -49,7 +52,7 @@ CHECKPOINT_HELP = "policy to load: the last one, or the best one seen during tra
 class ModelConfig:
     """The policy: one of the models in `modgnn_rl.models`."""
 
-    name: str = setting("moment_force", "model", choices=MODELS)
+    name: str | None = setting(None, "model; null: the task's default", choices=MODELS)
     hops: int = setting(1, "communication hops K per layer", ge=0)
     layers: int | None = setting(
         None, "layers L; the receptive field is L x K hops; null: the model's own default", ge=1
@@ -76,7 +79,7 @@ class EvaluationConfig:
 
     num_flocks: int = setting(100, "episodes per policy, with initial states unseen in training", ge=2)
     num_agents: Any = setting(None, "agents in a flock, or a list of sizes; null: as in training", ge=1, whole=True)
-    steps: int = setting(1000, "steps per episode", ge=4)
+    steps: int | None = setting(None, "steps per episode; null: env.max_steps", ge=4)
     seed: int = setting(
         1_000_000, "random seed of initial states and leaders, independent of those of training", ge=0, le=2**32
     )
@@ -106,7 +109,7 @@ class CollectorConfig:
 class TrainConfig:
     """A training run."""
 
-    env: FlockingConfig = field(default_factory=FlockingConfig)
+    env: TaskConfig = group(TASKS, TaskConfig, default=FlockingConfig)
     model: ModelConfig = group(MODELS, ModelConfig)
     trainer: Any = group(TRAINERS, TrainerConfig, required=True)
     collector: CollectorConfig = field(default_factory=CollectorConfig)
@@ -135,7 +138,7 @@ class TrainConfig:
 class CollectConfig:
     """A dataset of expert rollouts."""
 
-    env: FlockingConfig = field(default_factory=FlockingConfig)
+    env: TaskConfig = group(TASKS, TaskConfig, default=FlockingConfig)
     episodes: int = setting(1000, "rollouts in the dataset; an existing dataset is extended to this number", ge=1)
     steps: int | None = setting(None, "steps per rollout, none of which ends early; null: env.max_steps", ge=1)
     num_envs: int = setting(
@@ -249,7 +252,7 @@ class ScaleConfig:
 class ReproduceConfig:
     """The paper's evaluation, and the studies beyond it."""
 
-    env: FlockingConfig = field(default_factory=FlockingConfig)
+    env: TaskConfig = group(TASKS, TaskConfig, default=FlockingConfig)
     scale: ScaleConfig = field(default_factory=ScaleConfig)
     seeds: int = setting(1, "training runs per model, with different initial weights and batches", ge=1)
     after: str = setting(

@@ -22,7 +22,7 @@ from omegaconf import MISSING
 
 from modgnn_rl.errors import InputError, suggestion
 
-__all__ = ["as_list", "check", "flat", "group", "setting"]
+__all__ = ["as_list", "check", "flat", "group", "overrides_of", "setting"]
 
 
 def setting(
@@ -55,7 +55,7 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def group(registry: Mapping[str, Any], base: type, *, required: bool = False) -> Any:
+def group(registry: Mapping[str, Any], base: type, *, default: type | None = None, required: bool = False) -> Any:
     """Declare a dataclass field whose choices are the entries of a registry, each with its own settings.
 
     ``<field>=<name>`` on the command line chooses an entry. Its settings are an instance, with that ``name``, of the
@@ -64,12 +64,28 @@ def group(registry: Mapping[str, Any], base: type, *, required: bool = False) ->
     Args:
         registry: a `modgnn_rl.registry.Registry`.
         base: dataclass with a field ``name``, from which the settings of all entries are derived.
+        default: dataclass of the default; default: ``base``.
         required: whether the field has no default, for dataclasses built in Python.
     """
     metadata = {"registry": registry, "base": base}
     if required:
         return dataclasses.field(default=MISSING, metadata=metadata)
-    return dataclasses.field(default_factory=base, metadata=metadata)
+    return dataclasses.field(default_factory=default or base, metadata=metadata)
+
+
+def overrides_of(settings: type) -> type:
+    """A dataclass with the settings of a task, all of them None, for changes to the environment of a training run.
+
+    Args:
+        settings: dataclass of the task's settings. Its name, and what an evaluation sets itself, are left out.
+    """
+    entries = [
+        (entry.name, Any, dataclasses.field(default=None, metadata=entry.metadata))
+        for entry in dataclasses.fields(settings)
+        if entry.name not in ("name", "num_agents", "max_steps")
+    ]
+    doc = "Changes to the environment of the training run; null: as in training."
+    return dataclasses.make_dataclass("EnvOverrides", entries, namespace={"__module__": __name__, "__doc__": doc})
 
 
 def check(config: Any, path: str = "") -> None:
@@ -97,7 +113,7 @@ def check(config: Any, path: str = "") -> None:
 
 def _check_group(name: str, value: Any, registry: Any) -> None:
     """Raise InputError unless the settings of a field declared with `group` are those of the entry that they name."""
-    if not isinstance(value, registry[value.name].option("settings", object)):
+    if value.name is not None and not isinstance(value, registry[value.name].option("settings", object)):
         raise InputError(
             f"{name}.name={value.name} does not fit settings of type {type(value).__name__}: choose it by "
             f"{name}={value.name}"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shlex
+import sys
 
 from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import EvaluateConfig
+from modgnn_rl.experiment.resume import for_task_of_run
 from modgnn_rl.tracking.run_folder import RunFolder
 
 
@@ -28,4 +30,4 @@ def main(config: EvaluateConfig) -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, EvaluateConfig, "evaluate")
+    run_command(main, for_task_of_run(EvaluateConfig, sys.argv[1:]), "evaluate")

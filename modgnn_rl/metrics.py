@@ -5,8 +5,10 @@ the evaluation table and its JSON, on dashboards, in replays and in comparisons 
 
 - ``title``: name for people; ``unit``: ``"%"`` for a fraction of episodes, empty for none; ``better``: ``"lower"`` or
   ``"higher"``; ``about``: what it is, for the note below a table.
-- ``inputs``: what the function takes, of ``position``, ``action``, ``expert_action``, ``controlled`` and ``reward``;
-  default: the position. ``settings``: settings of the environment that it takes after them; default: none.
+- ``task``: the task that it is a metric of; default: all tasks that have its inputs.
+- ``inputs``: what the function takes, of ``position``, ``action``, ``expert_action``, ``difference`` (of these two),
+  ``controlled``, ``reward``, ``success``, and the task's own; default: the position. ``settings``: settings of the task
+  that it takes after them; default: none.
 - ``over_time``: how the steps of an episode become one value. ``"mean"`` and ``"sum"`` also average over the agents if
   the function returns a value per agent; ``"min"``, ``"any"``, and ``"last"``, the state after the last step, do not.
 - ``cell``: format of a cell of the table, of ``mean``, ``std``, ``median``, ``low`` and ``high`` over episodes, and, of
@@ -20,22 +22,29 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from modgnn_rl.registry import METRICS
+from modgnn_rl.registry import METRICS, TASKS
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from modgnn_rl.configs.schema import FlockingConfig
+    from modgnn_rl.configs.schema import TaskConfig
 
-__all__ = ["compute_metrics", "heading", "higher_is_better", "over_flocks"]
+__all__ = ["compute_metrics", "heading", "higher_is_better", "over_flocks", "unit_of"]
 
 
-def heading(name: str) -> str:
+def heading(name: str, task: str) -> str:
     """Title of a metric with its unit in brackets; of one that is not registered, its name in words."""
     if name not in METRICS:
         return name.replace("_", " ")
-    title, unit = (METRICS[name].options[key] for key in ("title", "unit"))
-    return f"{title} [{unit}]" if unit else str(title)
+    title, unit = str(METRICS[name].options["title"]), unit_of(name, task)
+    return f"{title} [{unit}]" if unit else title
+
+
+def unit_of(name: str, task: str) -> str:
+    """Unit of a metric; a task may say what that of the error or the reward is, with ``units=`` where it registers."""
+    entry = TASKS.peek(task)
+    units = {} if entry is None else entry.option("units", {})
+    return str(units.get(name, METRICS[name].options["unit"]))
 
 
 def higher_is_better(name: str) -> bool:
@@ -43,14 +52,12 @@ def higher_is_better(name: str) -> bool:
     return name in METRICS and METRICS[name].options["better"] == "higher"
 
 
-def compute_metrics(
-    names: Iterable[str], config: FlockingConfig, quantities: Mapping[str, Tensor]
-) -> dict[str, Tensor]:
+def compute_metrics(names: Iterable[str], config: TaskConfig, quantities: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Values of registered metrics.
 
     Args:
         names: of the metrics.
-        config: environment config, for the settings that metrics depend on.
+        config: settings of the task, for the settings that metrics depend on.
         quantities: by name, what the metrics are computed from (``inputs``), each with leading dimensions ``*B``.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Names of models, trainers and metrics, known before the code behind them is imported.
+"""Names of tasks, models, trainers and metrics, known before the code behind them is imported.
 
 Something is registered where it is defined, with a decorator::
 
@@ -31,7 +31,7 @@ from typing import Any, TypeVar
 
 from modgnn_rl.errors import InputError, suggestion
 
-__all__ = ["METRICS", "MODELS", "TRAINERS", "Entry", "Reference", "Registry"]
+__all__ = ["METRICS", "MODELS", "TASKS", "TRAINERS", "Entry", "Reference", "Registry"]
 
 T = TypeVar("T")
 
@@ -86,12 +86,12 @@ class Registry(Mapping[str, Entry]):
     Args:
         kind: what an entry is, for messages, as in ``"model"``.
         variable: name of the registry where it is used as a decorator, as in ``"MODELS"``.
-        package: package whose files are read, as in ``"modgnn_rl.models"``.
+        packages: packages whose files are read, as in ``"modgnn_rl.models"``.
         plugins: group of the entry points through which installed packages add entries; default: none.
     """
 
-    def __init__(self, kind: str, variable: str, package: str, *, plugins: str | None = None) -> None:
-        self.kind, self.variable, self.package, self.plugins = kind, variable, package, plugins
+    def __init__(self, kind: str, variable: str, *packages: str, plugins: str | None = None) -> None:
+        self.kind, self.variable, self.packages, self.plugins = kind, variable, packages, plugins
         self._added: dict[str, Entry] = {}
 
     @functools.cached_property
@@ -99,11 +99,12 @@ class Registry(Mapping[str, Entry]):
         """The entries of the library's own files, in the order of files and lines."""
         found: dict[str, Entry] = {}
         # The package knows its folder, whether that is a link, mapped by an editable installation, or in a wheel.
-        spec = importlib.util.find_spec(self.package)
-        for folder in map(Path, spec.submodule_search_locations or [] if spec else []):
-            for path in sorted(folder.rglob("*.py")):
-                module = ".".join([self.package, *path.relative_to(folder).with_suffix("").parts])
-                found |= {entry.name: entry for entry in _read(path, module, self.variable)}
+        for package in self.packages:
+            spec = importlib.util.find_spec(package)
+            for folder in map(Path, spec.submodule_search_locations or [] if spec else []):
+                for path in sorted(folder.rglob("*.py")):
+                    module = ".".join([package, *path.relative_to(folder).with_suffix("").parts])
+                    found |= {entry.name: entry for entry in _read(path, module, self.variable)}
         return found
 
     def register(self, name: str, **options: Any) -> Callable[[T], T]:
@@ -136,11 +137,13 @@ class Registry(Mapping[str, Entry]):
         return self._added.get(name) or self.built_in.get(name)
 
     def __getitem__(self, name: str) -> Entry:
-        """The entry of a name; an installed package's is imported now.
+        """The entry of a name; that of an installed package, or of a name ``<module>:<name>``, is imported now.
 
         Raises:
-            InputError: unknown name.
+            InputError: unknown name, or a module that cannot be imported.
         """
+        if self.peek(name) is None and ":" in name:
+            self._added[name] = self._imported(name)
         if self.peek(name) is None and self.plugins is not None:
             for plugin in entry_points(group=self.plugins, name=name):
                 target = plugin.load()  # which may run the decorator
@@ -152,6 +155,22 @@ class Registry(Mapping[str, Entry]):
             raise InputError(f"{self.kind} '{name}' is not one of {', '.join(names)}{suggestion(name, names)}")
         return entry
 
+    def _imported(self, name: str) -> Entry:
+        """The entry of a name ``<module>:<name>``, with the options of the decorator if the object has one."""
+        module, _, attribute = name.partition(":")
+        if "" not in sys.path:
+            sys.path.append("")  # a module in the working directory, also for commands that are installed scripts
+        try:
+            target = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise InputError(
+                f"{self.kind} '{name}' cannot be imported ({error}): expected <module>:<name>, with a module in this "
+                "folder or an installed one"
+            ) from error
+        known = (entry for entry in self._added.values() if entry.target is target)
+        options = next(known, Entry(name, target)).options
+        return Entry(name, target, options, (getattr(target, "__doc__", None) or "").partition("\n")[0])
+
     def __iter__(self) -> Iterator[str]:
         plugins = sorted(entry_points(group=self.plugins).names) if self.plugins is not None else []
         return iter(dict.fromkeys([*self.built_in, *plugins, *self._added]))
@@ -160,7 +179,7 @@ class Registry(Mapping[str, Entry]):
         return len(list(iter(self)))
 
     def __contains__(self, name: object) -> bool:
-        return name in list(self)
+        return name in list(self) or (isinstance(name, str) and ":" in name)
 
 
 def _read(path: Path, module: str, variable: str) -> Iterator[Entry]:
@@ -192,6 +211,7 @@ def _value(node: ast.expr, module: str, imports: Mapping[str, Reference]) -> Any
     return ast.literal_eval(node)
 
 
+TASKS = Registry("task", "TASKS", "modgnn_rl.envs", plugins="modgnn_rl.tasks")
 MODELS = Registry("model", "MODELS", "modgnn_rl.models", plugins="modgnn_rl.models")
 TRAINERS = Registry("trainer", "TRAINERS", "modgnn_rl.trainers", plugins="modgnn_rl.trainers")
-METRICS = Registry("metric", "METRICS", "modgnn_rl.envs")
+METRICS = Registry("metric", "METRICS", "modgnn_rl.envs", "modgnn_rl.evaluation")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import shlex
+import sys
 from pathlib import Path
 
 from modgnn_rl.cli.command import run_command
 from modgnn_rl.configs.schema import ReplayConfig, as_list
 from modgnn_rl.errors import InputError
+from modgnn_rl.experiment.resume import for_task_of_run
 from modgnn_rl.tracking.run_folder import RunFolder
 
 PACKAGES = {"html": (), "mp4": ("av", "matplotlib"), "svg": ("matplotlib",), "png": ("matplotlib",)}
@@ -65,4 +67,4 @@ def check_request(config: ReplayConfig) -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, ReplayConfig, "replay")
+    run_command(main, for_task_of_run(ReplayConfig, sys.argv[1:]), "replay")

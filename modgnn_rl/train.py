@@ -7,7 +7,7 @@ import sys
 
 from modgnn_rl.cli.command import run_command, settings_given
 from modgnn_rl.configs.schema import TrainConfig
-from modgnn_rl.experiment.resume import with_stored_trainer
+from modgnn_rl.experiment.resume import with_stored_choices
 from modgnn_rl.tracking.run_folder import RunFolder
 
 
@@ -41,5 +41,5 @@ def main(config: TrainConfig) -> None:
 
 
 if __name__ == "__main__":
-    sys.argv = with_stored_trainer(sys.argv)
+    sys.argv = with_stored_choices(sys.argv)
     run_command(main, TrainConfig, "train")

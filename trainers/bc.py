@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from tensordict.nn import TensorDictModuleBase
-
 from modgnn_rl.configs.schema import BCConfig, TrainConfig
 from modgnn_rl.data.dataset import EpisodeDataset
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
+from modgnn_rl.task import Task
 from modgnn_rl.trainers.collectors.windows import window_length
 from modgnn_rl.trainers.imitation.demonstrations import DART_PARTS, make_demonstrations
 from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
 from modgnn_rl.trainers.imitation.side_by_side import by_policy, member_configs, member_folders
 from modgnn_rl.trainers.loop.context import TrainContext
-from modgnn_rl.trainers.loop.setup import check_steps, check_updates, make_learner
+from modgnn_rl.trainers.loop.setup import check_expert, check_steps, check_updates, make_learner
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 from modgnn_rl.utils.seeds import derive_seed
 
@@ -30,15 +29,16 @@ ROLLOUT_ROUNDS = 20  # every so many rounds the policies are rolled out
 MAX_ROLLOUT_STEPS = 250  # steps of these rollouts
 
 
-def check_bc(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDictModuleBase | None) -> None:
+def check_bc(config: TrainConfig, policies: Sequence[ModGNN], task: Task) -> None:
     """Refuse too few updates, rollouts that are too short, and a dataset that is damaged or does not fit."""
     settings: BCConfig = config.trainer
+    check_expert(task, "bc")
     check_updates(config, "cloning_updates")
     if settings.dataset is None:
         parts = DART_PARTS if settings.dart else 1
         check_steps(config, "cloning_steps", parts * window_length(policies, settings))
         return
-    if expert is not None:
+    if task.has_other_expert:
         raise InputError(
             "trainer.dataset holds the labels of Reynolds flocking, not those of your expert; leave one out"
         )
@@ -76,7 +76,7 @@ def bc(context: TrainContext) -> dict[str, ModGNN]:
     rounds, updates = split_updates(settings.cloning_updates // len(sizes))
     total = rounds * updates * len(sizes)
     members = member_configs(config)
-    by_name = {name: make_learner(member, (total, total)) for name, member in members.items()}
+    by_name = {name: make_learner(member, context.task, (total, total)) for name, member in members.items()}
     names, learners = list(by_name), list(by_name.values())
     policies = {name: learner.ema_policy for name, learner in by_name.items()}
     data = make_demonstrations(context, list(policies.values()), rounds)
@@ -96,7 +96,7 @@ def bc(context: TrainContext) -> dict[str, ModGNN]:
                 metrics |= by_policy(names, f"{size}/validation_loss", validation_loss)
                 metrics[f"{size}/states"] = len(data.training[size].buffer)
                 if index % ROLLOUT_ROUNDS == 0:
-                    errors = closed_loop_errors(config, policies, size, context.expert)
+                    errors = closed_loop_errors(context, policies, size)
                     metrics |= by_policy(names, f"{size}/error", errors)
             scores = {name: sum(losses) / len(sizes) for name, *losses in zip(names, *validation_losses, strict=True)}
             metrics["gradient_norm"] = learners[0].gradient_norm
@@ -112,21 +112,18 @@ def split_updates(updates: int) -> tuple[int, int]:
     return rounds, updates // rounds
 
 
-def closed_loop_errors(
-    config: TrainConfig, policies: Mapping[str, ModGNN], size: int, expert: TensorDictModuleBase
-) -> list[float]:
+def closed_loop_errors(context: TrainContext, policies: Mapping[str, ModGNN], size: int) -> list[float]:
     """The error of each policy on short rollouts of its own, all from the same initial states."""
-    settings: BCConfig = config.trainer
+    config, settings = context.config, context.config.trainer
     rollouts = [
         rollout(
             policy,
-            config.env,
+            context.task,
             num_agents=size,
             num_flocks=settings.num_val_envs,
             steps=min(MAX_ROLLOUT_STEPS, settings.cloning_steps),
             seed=derive_seed(config.seed, "validation"),
             device=config.device,
-            expert=expert,
         )
         for policy in policies.values()
     ]

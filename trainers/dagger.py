@@ -7,11 +7,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from tensordict.nn import TensorDictModuleBase
-
 from modgnn_rl.configs.schema import DAggerConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
+from modgnn_rl.task import Task
 from modgnn_rl.trainers.collectors.behaviour import SafetyGate, beta_schedule, disagreement, ensemble_std
 from modgnn_rl.trainers.collectors.rollout_buffer import make_buffers, make_validation_buffers
 from modgnn_rl.trainers.collectors.windows import window_length
@@ -20,7 +19,7 @@ from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
 from modgnn_rl.trainers.loop.callbacks import StopOnPlateau
 from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.trainers.loop.metrics import mean_over_sizes, rollout_metrics
-from modgnn_rl.trainers.loop.setup import check_steps, check_updates, make_learner
+from modgnn_rl.trainers.loop.setup import check_expert, check_steps, check_updates, make_learner
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 
 __all__ = ["dagger"]
@@ -35,8 +34,9 @@ def ensemble_configs(config: TrainConfig) -> dict[str, TrainConfig]:
     return dict.fromkeys([config.model.name, *(f"ensemble_{number}" for number in others)], config)
 
 
-def check_dagger(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDictModuleBase | None) -> None:
-    """Refuse too few updates and rollouts that are too short."""
+def check_dagger(config: TrainConfig, policies: Sequence[ModGNN], task: Task) -> None:
+    """Refuse tasks without an expert, too few updates, and rollouts that are too short."""
+    check_expert(task, "dagger")
     check_updates(config, "cloning_updates")
     check_updates(config, "updates_per_round")
     check_steps(config, "steps_per_round", window_length(policies, config.trainer))
@@ -69,12 +69,15 @@ def dagger(context: TrainContext) -> dict[str, ModGNN]:
     cloning_updates, updates = settings.cloning_updates // len(sizes), settings.updates_per_round // len(sizes)
     total = (cloning_updates + settings.rounds * updates) * len(sizes)
     names = list(ensemble_configs(config))
-    learners = [make_learner(config, (cloning_updates * len(sizes), total), member) for member in range(len(names))]
-    policies, expert = [learner.ema_policy for learner in learners], context.expert
+    learners = [
+        make_learner(config, context.task, (cloning_updates * len(sizes), total), member)
+        for member in range(len(names))
+    ]
+    policies, task = [learner.ema_policy for learner in learners], context.task
     options: dict[str, Any] = {"steps": settings.steps_per_round, "hold_steps": settings.hold_steps}
     gate = None if settings.gate == "none" else SafetyGate(GATES[settings.gate], settings.gate_threshold)
-    training = make_buffers(config, context.make_env, policies, expert, **options, gate=gate)
-    validation = make_validation_buffers(config, context.make_env, policies, expert, **options)
+    training = make_buffers(config, task, policies, **options, gate=gate)
+    validation = make_validation_buffers(config, task, policies, **options)
 
     by_name = dict(zip(names, learners, strict=True))
     with TrainingLoop(with_early_stopping(context), by_name, training, validation, total=total) as loop:
@@ -89,7 +92,7 @@ def dagger(context: TrainContext) -> dict[str, ModGNN]:
                     buffer.extend(rollouts)  # aggregate
                 if index == 0:
                     buffer.collector.mixture.restart()
-                metrics |= rollout_metrics(rollouts, config.env)
+                metrics |= rollout_metrics(rollouts, task)
                 metrics[f"{size}/loss"], *_ = fit_together(learners, buffer.buffer, steps)
                 metrics[f"{size}/validation_loss"], *_ = validate_together(learners, validation[size].buffer)
                 metrics[f"{size}/states"] = len(buffer.buffer)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tensordict.nn import TensorDictModuleBase
-
 from modgnn_rl.configs.schema import MAPPOConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
+from modgnn_rl.task import Task
 from modgnn_rl.trainers.collectors.remote import make_collector
 from modgnn_rl.trainers.collectors.rollout_buffer import training_spec
 from modgnn_rl.trainers.loop.context import TrainContext
@@ -20,7 +19,7 @@ from modgnn_rl.trainers.ppo.learner import PPOLearner, ppo_window
 __all__ = ["kl_coef_of_round", "mappo"]
 
 
-def check_mappo(config: TrainConfig, policies: Sequence[ModGNN], expert: TensorDictModuleBase | None) -> None:
+def check_mappo(config: TrainConfig, policies: Sequence[ModGNN], task: Task) -> None:
     """Refuse rollouts that are too short."""
     check_steps(config, "steps_per_round", ppo_window(policies[0], config.trainer)[1])
 
@@ -38,10 +37,10 @@ def mappo(context: TrainContext) -> dict[str, ModGNN]:
     Returns:
         the trained policy, the moving average of the weights, by the name of its model.
     """
-    config, settings, sizes = context.config, context.config.trainer, context.config.env.sizes
-    learner = PPOLearner(initial_policy(config), settings, config.env.state_key, config.seed)
-    specs = {size: training_spec(config, context.make_env, size, settings.steps_per_round) for size in sizes}
-    behaviour = (learner.actor, context.expert)
+    config, settings, task = context.config, context.config.trainer, context.task
+    learner = PPOLearner(initial_policy(config, task), task, settings, config.seed)
+    specs = {size: training_spec(config, task, size, settings.steps_per_round) for size in task.sizes}
+    behaviour = [learner.actor] if task.teacher is None else [learner.actor, task.teacher]
     collectors = {size: make_collector(spec, behaviour, config.collector) for size, spec in specs.items()}
 
     name = config.model.name
@@ -51,12 +50,13 @@ def mappo(context: TrainContext) -> dict[str, ModGNN]:
             metrics = {"noise": learner.actor.noise, "kl_coef": kl_coef, "learning_rate": settings.learning_rate}
             for size, collector in collectors.items():
                 rollouts = loop.on_collect(collector.collect())
-                metrics |= rollout_metrics(rollouts, config.env) | reward_metrics(rollouts, config.env)
+                metrics |= rollout_metrics(rollouts, task) | reward_metrics(rollouts, task)
                 losses = learner.update(rollouts, kl_coef=kl_coef, critic_only=index <= settings.critic_warmup)
                 metrics |= {f"{size}/{key}": value for key, value in losses.items()}
-            metrics["reward"] = reward = mean_over_sizes(metrics, "reward", sizes)
-            metrics["error"] = error = mean_over_sizes(metrics, "error", sizes)
-            loop.log(metrics, 1, {name: -reward}, reward=reward, error=error)
+            shown = {
+                key: mean_over_sizes(metrics, key, task.sizes) for key in ("reward", "error") if key in task.metrics
+            }
+            loop.log(metrics | shown, 1, {name: -shown["reward"]}, **shown)
 
     return {name: learner.ema_policy}
 

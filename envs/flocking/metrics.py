@@ -1,4 +1,4 @@
-"""Metrics of a flock: those of the paper (section Results), safety, and reward, as functions of tensors.
+"""Metrics of a flock: those of the paper (section Results) and safety, as functions of tensors.
 
 A flock is ``position [*B, N, 3]`` in metres, with any leading dimensions ``*B`` (flocks, time steps, seeds); the
 result has one value per flock, ``[*B]``, unless it says otherwise. Distances are computed from coordinate differences
@@ -20,8 +20,6 @@ from modgnn_rl.registry import METRICS
 from modgnn_rl.utils.tensors import pair_blocks, pair_differences, squared_norm
 
 __all__ = [
-    "action_error",
-    "agent_reward",
     "cohesion",
     "collision_rate",
     "is_diverged",
@@ -33,36 +31,8 @@ __all__ = [
 
 
 @METRICS.register(
-    "error",
-    title="error",
-    unit="m²/s²",
-    better="lower",
-    about="mean squared error of the action against the expert's, per component, over the agents the policy controls",
-    inputs=("action", "expert_action", "controlled"),
-    over_time="mean",
-    cell="{mean:.3f} ± {std:.3f} [{low:.3f}, {high:.3f}]",
-    replay=True,
-)
-def action_error(action: Tensor, expert_action: Tensor, controlled: Tensor) -> Tensor:
-    """Mean squared error per component against the expert, over the agents that the policy controls.
-
-    ``sum_i c_i |u_i - u*_i|^2 / (D sum_i c_i)`` with ``c = controlled``; the paper's "Error". Values of the other
-    agents have no influence, not even a NaN.
-
-    Args:
-        action: ``[*B, N, D]``, target velocity in m/s.
-        expert_action: ``[*B, N, D]``, m/s.
-        controlled: ``[*B, N]`` bool, the agents that the policy controls.
-
-    Returns:
-        ``[*B]`` in (m/s)^2; NaN for a flock without controlled agents.
-    """
-    squared = (action - expert_action).square().mean(-1)
-    return torch.where(controlled, squared, 0.0).sum(-1) / controlled.sum(-1)
-
-
-@METRICS.register(
     "leader_distance",
+    task="flocking",
     title="leader distance",
     unit="m",
     better="lower",
@@ -93,6 +63,7 @@ def leader_distance(position: Tensor, leader: int = 0) -> Tensor:
 
 @METRICS.register(
     "cohesion",
+    task="flocking",
     title="cohesion",
     unit="m",
     better="lower",
@@ -116,6 +87,7 @@ def cohesion(position: Tensor) -> Tensor:
 
 @METRICS.register(
     "separation",
+    task="flocking",
     title="separation",
     unit="m",
     better="higher",
@@ -144,6 +116,7 @@ def separation(position: Tensor) -> Tensor:
 
 @METRICS.register(
     "min_distance",
+    task="flocking",
     title="minimum distance",
     unit="m",
     better="higher",
@@ -165,6 +138,7 @@ def min_distance(position: Tensor) -> Tensor:
 
 @METRICS.register(
     "collision_rate",
+    task="flocking",
     title="collision rate",
     unit="pairs",
     better="lower",
@@ -188,22 +162,8 @@ def collision_rate(position: Tensor, distance: float) -> Tensor:
 
 
 @METRICS.register(
-    "reward",
-    title="reward",
-    unit="",
-    better="higher",
-    about="reward of an agent, summed over the episode",
-    inputs=("reward",),
-    over_time="sum",
-    cell="{mean:.1f} [{low:.1f}, {high:.1f}]",
-)
-def agent_reward(reward: Tensor) -> Tensor:
-    """Reward of each agent in a step, ``[*B, N]``, as the environment gives it."""
-    return reward
-
-
-@METRICS.register(
     "leader_lost",
+    task="flocking",
     title="leader lost",
     unit="%",
     better="lower",
@@ -235,6 +195,7 @@ def leader_lost(position: Tensor, comm_range: float, leader: int = 0) -> Tensor:
 
 @METRICS.register(
     "diverged",
+    task="flocking",
     title="diverged",
     unit="%",
     better="lower",

@@ -64,10 +64,13 @@ def register(command: Command, arguments: Sequence[str], *, load_all: bool, scra
         InputError: settings of a registered choice that do not fit.
     """
     store = ConfigStore.instance()
-    store.store(name=f"{command.name}_schema", node=command.schema)
-    for field in dataclasses.fields(command.schema):
+    grouped = [field for field in dataclasses.fields(command.schema) if "registry" in field.metadata]
+    # A default that a group replaces must not have settings of its own.
+    bases = {field.name: field.metadata["base"]() for field in grouped if field.default is dataclasses.MISSING}
+    store.store(name=f"{command.name}_schema", node=command.schema(**bases))
+    for field in grouped:
         store.repo.pop(field.name, None)  # choices of a command that ran before in this process
-        for choice in field.metadata.get("registry", ()):
+        for choice in (*field.metadata["registry"], *_references(field.name, arguments)):
             load = load_all or any(choice in argument for argument in arguments)
             store.store(group=field.name, name=choice, node=choice_settings(field, choice, load=load))
     quiet = {"hydra_logging": "none", "job_logging": "none"}
@@ -86,6 +89,12 @@ def register(command: Command, arguments: Sequence[str], *, load_all: bool, scra
         return help_text(command.main, command.name, _root_).replace("$", "$$")
 
     OmegaConf.register_new_resolver("modgnn_rl_help", show_help, replace=True)
+
+
+def _references(group: str, arguments: Sequence[str]) -> list[str]:
+    """The choices of a group on a command line that name an object in a module, ``<module>:<name>``."""
+    given = (argument.partition("=")[2] for argument in arguments if argument.startswith(f"{group}="))
+    return [choice for value in given for choice in value.split(",") if ":" in choice]
 
 
 def choice_settings(field: dataclasses.Field[Any], choice: str, *, load: bool) -> Any:

@@ -17,39 +17,41 @@ from modgnn_rl.evaluation.rollout import EpisodeMetrics
 from modgnn_rl.evaluation.statistics import paired_difference, summarise
 from modgnn_rl.metrics import heading
 from modgnn_rl.registry import METRICS
+from modgnn_rl.task import Task
 from modgnn_rl.utils.text import markdown
 
 __all__ = ["evaluation_markdown", "read_tables", "summarise_rollouts"]
 
-YARDSTICK = "local expert (1 hop)"
 ERROR_COLUMNS = ("policy", "error", "median", "by episode quarter")
 NOTE = """\
-All policies start from the same states and follow the same leaders; no episode ends early. Mean ± standard deviation \
-over episodes [95 % confidence interval of the mean]. Median: of the error, over episodes. By episode quarter: mean \
-error in each quarter of the episode."""
+All policies start from the same states. An episode that ends early counts with the steps that it has. Mean ± standard \
+deviation over episodes [95 % confidence interval of the mean]. Median: of the error, over episodes. By episode \
+quarter: mean error in each quarter of the episode."""
 
 
-def summarise_rollouts(rollouts: Mapping[str, EpisodeMetrics], seed: int) -> dict[str, Any]:
+def summarise_rollouts(rollouts: Mapping[str, EpisodeMetrics], task: Task, seed: int) -> dict[str, Any]:
     """Summarise the episodes of each policy.
 
     Args:
         rollouts: by name of the policy, all from the same starts.
+        task: of the policies.
         seed: seed of the bootstrap.
 
     Returns:
         for each policy, by name of the metric: the ``mean`` over episodes (the fraction if it holds or does not) and
         their number ``n``; of a number, also ``std``, ``median`` and the confidence interval of the mean (``low``,
         ``high``); of a mean over time, ``std_over_time``, over time, agents and episodes; of a minimum, ``min``. None
-        where the flock is too small for the metric. Besides, ``error_by_quarter``, and ``error_minus_local``, the
-        paired difference from the error of the local expert (1 hop).
+        where the flock is too small for the metric. If the task has an expert, also ``error_by_quarter``, and if it has
+        a yardstick, ``error_minus_local``, the paired difference from the error of that reference policy.
     """
     rng = np.random.default_rng(seed)
     table: dict[str, Any] = {}
     for name, rollout in rollouts.items():
-        row: dict[str, Any] = {metric: _summary(rollout, metric, rng) for metric in METRICS}
-        row["error_by_quarter"] = rollout.error_by_quarter.mean(0).tolist()
-        if YARDSTICK in rollouts and name != YARDSTICK and row["error"] is not None:
-            own, local = (episodes["error"].cpu().numpy() for episodes in (rollout, rollouts[YARDSTICK]))
+        row: dict[str, Any] = {metric: _summary(rollout, metric, rng) for metric in task.metrics}
+        if "error" in task.metrics:
+            row["error_by_quarter"] = rollout.error_by_quarter.nanmean(0).tolist()
+        if task.yardstick in rollouts and name != task.yardstick and row["error"] is not None:
+            own, local = (episodes["error"].cpu().numpy() for episodes in (rollout, rollouts[task.yardstick]))
             row["error_minus_local"] = dataclasses.asdict(paired_difference(own, local, rng=rng))
         table[name] = row
     return table
@@ -92,18 +94,24 @@ def evaluation_markdown(tables: Mapping[str, Any], title: str) -> str:
             `summarise_rollouts` makes of them.
         title: heading of the page.
     """
-    fractions = [name for name, entry in METRICS.items() if entry.options["unit"] == "%"]
-    others = [name for name in METRICS if name not in ("error", *fractions)]
+    named = {name for table in tables.values() for row in table["rows"].values() for name in row}
+    metrics = sorted((name for name in METRICS if name in named), key=lambda name: name != "error")
+    fractions = [name for name in metrics if METRICS[name].options["unit"] == "%"]
+    others = [name for name in metrics if name not in ("error", *fractions)]
+    has_error = "error" in metrics
     parts = [f"# {title}"]
     for size, table in tables.items():
-        errors: list[list[str]] = [[*ERROR_COLUMNS, *map(_title, fractions)]]
+        errors: list[list[str]] = [[*(ERROR_COLUMNS if has_error else ("policy",)), *map(_title, fractions)]]
         shapes: list[list[str]] = [["policy", *map(_title, others)]]
         for name, row in table["rows"].items():
-            errors.append([name, *_error_cells(row), *(_cell(row, metric) for metric in fractions)])
+            errors.append(
+                [name, *(_error_cells(row) if has_error else ()), *(_cell(row, metric) for metric in fractions)]
+            )
             shapes.append([name, *(_cell(row, metric) for metric in others)])
         head = f"## {size} agents, {table['num_flocks']} episodes of {table['steps']} steps"
-        parts += [head, markdown(errors), markdown(shapes)]
-    explained = (f"{heading(name).capitalize()}: {entry.options['about']}." for name, entry in METRICS.items())
+        parts += [head, *(markdown(columns) for columns in (errors, shapes) if len(columns[0]) > 1)]
+    (task,) = {str(table["task"]) for table in tables.values()}
+    explained = (f"{heading(name, task).capitalize()}: {METRICS[name].options['about']}." for name in metrics)
     note = textwrap.fill(" ".join([NOTE, *explained]), 120, break_on_hyphens=False)
     return "\n\n".join([*parts, note]) + "\n"
 

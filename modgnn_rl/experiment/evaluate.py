@@ -7,15 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tensordict.nn import TensorDictModuleBase
-
-from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, FlockingConfig, as_list
+from modgnn_rl.configs.schema import EvaluateConfig, EvaluationConfig, as_list
 from modgnn_rl.configs.settings import check
-from modgnn_rl.envs.flocking.recording import FlockRecorder
+from modgnn_rl.evaluation.recording import Recorder
 from modgnn_rl.evaluation.rollout import evaluate
 from modgnn_rl.evaluation.table import evaluation_markdown, read_tables, summarise_rollouts
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.tracking.loading import load_env_config, load_policy, override_env_config
+from modgnn_rl.task import Task
+from modgnn_rl.tracking.loading import changed_task, load_policy, load_task
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.visualization.html import write_replay
@@ -29,58 +28,57 @@ MAX_REPLAY_FRAMES = 250  # writing more would take longer than a second
 def evaluate_policies(
     run: RunFolder,
     policies: Mapping[str, ModGNN],
-    env_config: FlockingConfig,
+    task: Task,
     settings: EvaluationConfig,
     device: str,
     *,
     changes: str = "",
-    expert: TensorDictModuleBase | None = None,
 ) -> dict[int, dict[str, Any]]:
     """Evaluate a run's policies beside the reference policies, and write tables and replays into the run folder.
 
     Args:
         run: the run folder.
         policies: by name.
-        env_config: environment config; the numbers of agents are its, unless the settings have their own.
+        task: of the policies; the numbers of agents are its, unless the settings have their own.
         settings: of the evaluation.
         device: of the rollouts.
         changes: differences from the run's own environment as ``name=value``, separated by commas; they name the files.
-        expert: the policy's teacher; default: Reynolds flocking.
 
     Returns:
         for each number of agents, what `modgnn_rl.evaluation.table.summarise_rollouts` returns.
     """
     tables, recorders = {}, {}
-    for size in as_list(settings.num_agents or env_config.num_agents):
-        stride = recording_stride(size, settings.steps, MAX_REPLAY_FRAMES)
-        recorders[size] = {name: FlockRecorder(env_config, stride) for name in (*policies, "expert")}
+    steps = settings.steps or task.evaluation_steps
+    for size in as_list(settings.num_agents or task.sizes):
+        stride = recording_stride(size, steps, MAX_REPLAY_FRAMES)
+        recorded = [*policies, *(["expert"] if task.teacher is not None else [])] if task.has_positions else []
+        recorders[size] = {name: Recorder(task, stride) for name in recorded}
         rollouts = evaluate(
             policies,
-            env_config,
+            task,
             num_agents=size,
             num_flocks=settings.num_flocks,
-            steps=settings.steps,
+            steps=steps,
             seed=settings.seed,
             device=device,
-            expert=expert,
             watches=recorders[size],
         )
-        tables[size] = summarise_rollouts(rollouts, settings.seed)
+        tables[size] = summarise_rollouts(rollouts, task, settings.seed)
+    about = {"num_flocks": settings.num_flocks, "steps": steps, "seed": settings.seed, "task": task.name}
     title = f"{run.path.name} with {changes}" if changes else run.path.name
     file = evaluation_file(run, changes)
-    print(f"\n{_write_tables(run, file, tables, settings, title)}", flush=True)
+    print(f"\n{_write_tables(run, file, tables, about, title)}", flush=True)
     for size, page in _write_replays(file, recorders, settings, title).items():
         print(f"Replay of {size} agents, for a browser: {page}", flush=True)
     return tables
 
 
-def _write_tables(run: RunFolder, file: Path, tables: Mapping[int, Any], settings: EvaluationConfig, title: str) -> str:
+def _write_tables(run: RunFolder, file: Path, tables: Mapping[int, Any], about: Mapping[str, Any], title: str) -> str:
     """Add tables to a file of JSON and the Markdown page beside it, which may have some of other sizes.
 
     Returns:
         the new tables as Markdown.
     """
-    about = {"num_flocks": settings.num_flocks, "steps": settings.steps, "seed": settings.seed}
     new = {str(size): {**about, "rows": table} for size, table in tables.items()}
     entries = dict(sorted({**read_tables(file), **new}.items(), key=lambda entry: int(entry[0])))
     run.write(file.name, json.dumps(entries, indent=2) + "\n")
@@ -89,11 +87,13 @@ def _write_tables(run: RunFolder, file: Path, tables: Mapping[int, Any], setting
 
 
 def _write_replays(
-    file: Path, recorders: Mapping[int, Mapping[str, FlockRecorder]], settings: EvaluationConfig, title: str
+    file: Path, recorders: Mapping[int, Mapping[str, Recorder]], settings: EvaluationConfig, title: str
 ) -> dict[int, Path]:
     """Write a replay of the first flock for each number of agents, beside the file of the tables."""
     pages = {}
     for size, by_policy in recorders.items():
+        if not by_policy:
+            continue
         pages[size] = file.with_name(file.stem.replace("evaluation", f"replay-{size}", 1) + ".html")
         recordings = {name: recorder.recording() for name, recorder in by_policy.items()}
         write_replay(pages[size], recordings, title, {"seed": settings.seed, "flock": f"1 of {settings.num_flocks}"})
@@ -126,11 +126,11 @@ def evaluate_run(config: EvaluateConfig, run: RunFolder | None = None) -> Path:
     check(config)
     prepare_torch(config.device, config.threads)
     run = run or RunFolder.open(config.run)
-    trained_in = load_env_config(run)
-    policy = load_policy(run, device=config.device, which=config.checkpoint, env_config=trained_in)
-    env_config, changed = override_env_config(trained_in, config.env)
+    trained_on = load_task(run)
+    policy = load_policy(run, device=config.device, which=config.checkpoint, task=trained_on)
+    task, changed = changed_task(trained_on, config.env)
     best = {"checkpoint": "best"} if config.checkpoint == "best" else {}
     changes = ",".join(f"{name}={value}" for name, value in sorted({**changed, **best}.items()))
     policies = {run.config["model"]["name"]: policy}
-    evaluate_policies(run, policies, env_config, config.evaluation, config.device, changes=changes)
+    evaluate_policies(run, policies, task, config.evaluation, config.device, changes=changes)
     return evaluation_file(run, changes)

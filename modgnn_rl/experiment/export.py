@@ -7,9 +7,8 @@ import torch
 from modgnn_rl.configs.schema import ExportConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.deploy.export import Exported, check_packages, export_agent
-from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.tracking.loading import load_env_config, load_policy
+from modgnn_rl.tracking.loading import load_policy, load_task
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.device import prepare_torch
 
@@ -33,14 +32,13 @@ def export_run(config: ExportConfig, run: RunFolder | None = None) -> tuple[Expo
     check_packages()
     prepare_torch("cpu", config.threads)
     run = run or RunFolder.open(config.run)
-    env_config = load_env_config(run)
-    policy = load_policy(run, env_config=env_config)
-    spec = FlockingEnv(1, 2, config=env_config).observation_spec["agents", "observation"]
+    task = load_task(run)
+    policy = load_policy(run, task=task)
     exported = export_agent(
         policy,
         run.path / "agent" if config.output is None else config.output,
-        torch.zeros(spec.shape[-1], dtype=spec.dtype),
+        torch.zeros(task.layout.width),
         model=run.config["model"]["name"],
-        control_frequency=env_config.control_frequency,
+        control_frequency=task.frequency,
     )
     return exported, policy

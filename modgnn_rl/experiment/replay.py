@@ -8,12 +8,12 @@ from pathlib import Path
 
 from tensordict.nn import TensorDictModuleBase
 
-from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig, as_list
+from modgnn_rl.configs.schema import ReplayConfig, as_list
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.recording import record
-from modgnn_rl.evaluation.rollout import reference_policies
-from modgnn_rl.tracking.loading import load_env_config, load_policy, override_env_config
+from modgnn_rl.task import Task
+from modgnn_rl.tracking.loading import changed_task, load_policy, load_task
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.utils.progress import Progress
@@ -35,11 +35,13 @@ def replay_run(config: ReplayConfig) -> Path:
     check(config)
     prepare_torch(config.device, config.threads)
     runs = [RunFolder.open(folder) for folder in (config.run, *as_list(config.others or []))]
-    env_config, changes = override_env_config(load_env_config(runs[0]), config.env)
-    agents = _num_agents(config, env_config)
-    policies = _policies(config, runs, env_config)
+    task, changes = changed_task(load_task(runs[0]), config.env)
+    if not task.has_positions:
+        raise InputError(f"task '{task.name}' has no positions, so there is nothing to replay")
+    agents = _num_agents(config, task)
+    policies = _policies(config, runs, task)
     path = Path(config.output or runs[0].path / f"replay.{config.format}").absolute()
-    recordings = _record(policies, env_config, config, agents)
+    recordings = _record(policies, task, config, agents)
     try:
         if config.format == "mp4":
             from modgnn_rl.visualization.video import write_video
@@ -58,12 +60,10 @@ def replay_run(config: ReplayConfig) -> Path:
     return path
 
 
-def _num_agents(config: ReplayConfig, env_config: FlockingConfig) -> int:
-    if config.num_agents is None and len(env_config.sizes) > 1:
-        raise InputError(
-            f"the run was trained with {env_config.sizes} agents; choose one size: num_agents={env_config.sizes[0]}"
-        )
-    return int(config.num_agents or env_config.sizes[0])
+def _num_agents(config: ReplayConfig, task: Task) -> int:
+    if config.num_agents is None and len(task.sizes) > 1:
+        raise InputError(f"the run was trained with {task.sizes} agents; choose one size: num_agents={task.sizes[0]}")
+    return int(config.num_agents or task.sizes[0])
 
 
 def _last_step(config: ReplayConfig) -> int:
@@ -71,9 +71,7 @@ def _last_step(config: ReplayConfig) -> int:
     return config.steps - 1 if config.step is None else config.step
 
 
-def _policies(
-    config: ReplayConfig, runs: Sequence[RunFolder], env_config: FlockingConfig
-) -> dict[str, TensorDictModuleBase]:
+def _policies(config: ReplayConfig, runs: Sequence[RunFolder], task: Task) -> dict[str, TensorDictModuleBase]:
     """The policies by name: that of the first run, the expert, those of the other runs; for a video, the first."""
     policies: dict[str, TensorDictModuleBase] = {}
     for run in runs[:1] if config.format == "mp4" else runs:
@@ -81,13 +79,13 @@ def _policies(
         if name in policies:
             name = f"{name}, {run.path.name}"
         policies[name] = load_policy(run, device=config.device, which=config.checkpoint)
-        if config.with_expert and config.format != "mp4" and len(policies) == 1:
-            policies["expert"] = reference_policies(env_config)["expert"]
+        if config.with_expert and task.teacher is not None and config.format != "mp4" and len(policies) == 1:
+            policies["expert"] = task.reference_policies()["expert"]
     return policies
 
 
 def _record(
-    policies: Mapping[str, TensorDictModuleBase], env_config: FlockingConfig, config: ReplayConfig, num_agents: int
+    policies: Mapping[str, TensorDictModuleBase], task: Task, config: ReplayConfig, num_agents: int
 ) -> dict[str, Recording]:
     """Record a rollout of each policy; the viewer, if wanted, shows the first one live."""
     stride, steps = config.stride or recording_stride(num_agents, config.steps), config.steps
@@ -106,10 +104,10 @@ def _record(
             if config.viewer and not recordings:
                 from modgnn_rl.visualization.viewer import Viewer
 
-                viewer = stack.enter_context(Viewer(env_config.control_frequency, config.port))
+                viewer = stack.enter_context(Viewer(task.frequency, config.port))
             recordings[name] = record(
                 policy,
-                env_config,
+                task,
                 num_agents=num_agents,
                 steps=steps,
                 seed=config.seed,

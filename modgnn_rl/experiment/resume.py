@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -10,22 +11,23 @@ from typing import Any, cast
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from modgnn_rl.configs.schema import TrainConfig
-from modgnn_rl.configs.settings import flat
+from modgnn_rl.configs.schema import TaskConfig, TrainConfig
+from modgnn_rl.configs.settings import flat, overrides_of
 from modgnn_rl.errors import InputError
-from modgnn_rl.registry import TRAINERS
+from modgnn_rl.registry import TASKS, TRAINERS
 from modgnn_rl.tracking.run_folder import RunFolder
 
 __all__ = [
     "changed_config",
     "differences",
+    "for_task_of_run",
     "requires_restart",
     "stored_config",
-    "with_stored_trainer",
+    "with_stored_choices",
 ]
 
 # Settings that cannot change once a run has started, beside those of the trainer's own option `fixed`.
-FIXED = ("model", "trainer.name", "init_from", "seed", "runs", "name")
+FIXED = ("model", "trainer.name", "env.name", "init_from", "seed", "runs", "name")
 # If one of these changes, environments and training data start afresh.
 RESTARTING = (
     "env",
@@ -49,7 +51,8 @@ def stored_config(run: RunFolder) -> TrainConfig:
     """
     try:
         trainer = TRAINERS[run.config["trainer"]["name"]].option("settings")()
-        structure = OmegaConf.structured(TrainConfig(trainer=trainer))
+        env = TASKS[run.config["env"]["name"]].option("settings", TaskConfig)()
+        structure = OmegaConf.structured(TrainConfig(env=env, trainer=trainer))
         return cast(TrainConfig, OmegaConf.to_object(OmegaConf.merge(structure, run.config)))
     except (InputError, KeyError, TypeError, OmegaConfBaseException) as error:
         raise InputError(
@@ -71,7 +74,10 @@ def changed_config(old: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     """
     structure = OmegaConf.structured(old)
     for key, value in changes.items():
-        key, value = (f"{key}.name", value.name) if key in ("trainer", "model") else (key, value)
+        if key in ("trainer", "model") or (key == "env" and value.name != old.env.name):
+            key, value = f"{key}.name", value.name
+        elif key == "env" and value.name != TrainConfig().env.name:
+            continue  # the task that `with_stored_choices` has named
         try:
             OmegaConf.update(structure, key, value)
         except OmegaConfBaseException as error:
@@ -106,17 +112,48 @@ def requires_restart(changed: Mapping[str, tuple[Any, Any]]) -> list[str]:
     ]
 
 
-def with_stored_trainer(arguments: Sequence[str]) -> list[str]:
-    """The arguments of a command line, with the trainer of the run that it resumes, whose settings are then known."""
+def with_stored_choices(arguments: Sequence[str]) -> list[str]:
+    """The arguments of a command line, with the trainer and the task of the run that it resumes.
+
+    Their settings are then known. The flocking task is the default, and need not be named.
+    """
     named = list(arguments)
-    if not any(argument.startswith("trainer=") for argument in arguments):
-        for index, argument in enumerate(arguments):
-            if argument.startswith("resume="):
-                # Errors of the folder are reported later, where the run is opened.
-                with contextlib.suppress(InputError, KeyError, TypeError):
-                    trainer = RunFolder.open(Path(argument.partition("=")[2])).config["trainer"]["name"]
-                    named.insert(index + 1, f"trainer={trainer}")
+    for index, argument in enumerate(arguments):
+        if argument.startswith("resume="):
+            config = _config_of(argument)
+            for group in ("trainer", "env"):
+                name = (config.get(group) or {}).get("name")
+                if name and name != TrainConfig().env.name and not _is_given(group, arguments):
+                    named.insert(index + 1, f"{group}={name}")
     return named
+
+
+def for_task_of_run(schema: type, arguments: Sequence[str]) -> type:
+    """The settings of a command with those of the task of the run that it is for, under ``env``.
+
+    Args:
+        schema: settings with the fields ``run`` and ``env``, the changes to the environment.
+        arguments: command line.
+    """
+    folders = [argument for argument in arguments if argument.startswith("run=")]
+    name = (_config_of(folders[0]).get("env") or {}).get("name") if folders else None
+    with contextlib.suppress(InputError):  # an unknown task is reported when the run is opened
+        if name is not None:
+            env = dataclasses.field(default_factory=overrides_of(TASKS[name].option("settings", TaskConfig)))
+            about = {"__doc__": schema.__doc__, "__module__": schema.__module__}
+            return dataclasses.make_dataclass(schema.__name__, [("env", Any, env)], bases=(schema,), namespace=about)
+    return schema
+
+
+def _config_of(argument: str) -> dict[str, Any]:
+    """The configuration of the run folder that ``<setting>=<folder>`` names; errors are reported where it is opened."""
+    with contextlib.suppress(InputError, KeyError, TypeError):
+        return RunFolder.open(Path(argument.partition("=")[2])).config
+    return {}
+
+
+def _is_given(group: str, arguments: Sequence[str]) -> bool:
+    return any(argument.startswith(f"{group}=") for argument in arguments)
 
 
 def _is_among(key: str, names: Sequence[str]) -> bool:

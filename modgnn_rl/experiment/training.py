@@ -15,13 +15,12 @@ from tensordict.nn import TensorDictModuleBase
 
 from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.configs.settings import check
-from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
 from modgnn_rl.errors import one_line
 from modgnn_rl.experiment.evaluate import evaluate_policies
 from modgnn_rl.experiment.resume import changed_config, differences, requires_restart, stored_config
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
+from modgnn_rl.task import Task, make_task
 from modgnn_rl.tracking.checkpoint import Checkpoint, has_checkpoint, load_checkpoint
 from modgnn_rl.tracking.loggers import LoggerGroup, check_logger, make_logger
 from modgnn_rl.tracking.run_folder import RunFolder
@@ -52,7 +51,7 @@ def train(
     Args:
         config: all settings. They are checked here, before anything is created; trainers rely on that.
         expert: the policy to imitate, and to measure errors against: any TensorDictModule that reads the environment's
-            keys and writes ``("agents", "expert_action")``. Default: Reynolds flocking.
+            keys and writes ``("agents", "expert_action")``. Default: the task's own.
         callbacks: your own code, see `modgnn_rl.trainers.loop.callbacks`.
         evaluate: whether to evaluate the policies at the end.
 
@@ -62,12 +61,12 @@ def train(
     Raises:
         InputError: an invalid setting, or a device or logger that this machine does not have; nothing is created then.
     """
-    config = _checked(config, expert)
+    config, task = _checked(config, expert)
     with distributed.process_group(config.device):
         run = _new_run(config)
         with _lock(run):
             distributed.print_rank0(f"Training in {run.path}")
-            return _run(config, run, expert, callbacks, evaluate=evaluate)
+            return _run(config, run, task, callbacks, evaluate=evaluate)
 
 
 def resume(
@@ -102,14 +101,14 @@ def resume(
     old = stored_config(run)
     config = changed_config(old, changes or {})
     changed = differences(old, config)
-    config = _checked(config, expert)
+    config, task = _checked(config, expert)
     with distributed.process_group(config.device), _lock(run):
         checkpoint = load_checkpoint(run.checkpoints) if has_checkpoint(run.checkpoints) else None
         restarts = requires_restart(changed)
         if changed and distributed.is_first():
             run = run.with_config(OmegaConf.to_yaml(OmegaConf.structured(config)))
         _announce(run, checkpoint, restarts)
-        return _run(config, run, expert, callbacks, checkpoint, restore_rollouts=not restarts, evaluate=evaluate)
+        return _run(config, run, task, callbacks, checkpoint, restore_rollouts=not restarts, evaluate=evaluate)
 
 
 def _announce(run: RunFolder, checkpoint: Checkpoint | None, restarts: Sequence[str]) -> None:
@@ -124,14 +123,15 @@ def _announce(run: RunFolder, checkpoint: Checkpoint | None, restarts: Sequence[
         distributed.print_rank0("Environments and training data start afresh in all processes but the first")
 
 
-def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> TrainConfig:
-    """The settings of a run with the model resolved, after all checks that need no run folder."""
+def _checked(config: TrainConfig, expert: TensorDictModuleBase | None) -> tuple[TrainConfig, Task]:
+    """The settings of a run with the model resolved, and its task, after all checks that need no run folder."""
     check(config)
     prepare_torch(distributed.own_device(config.device), config.threads)
     check_logger(config)
-    config = resolve_model(config)
-    check_training(config, expert)
-    return config
+    task = make_task(config.env).with_expert(expert)
+    config = resolve_model(config, task)
+    check_training(config, task)
+    return config, task
 
 
 def _new_run(config: TrainConfig) -> RunFolder:
@@ -152,7 +152,7 @@ def _lock(run: RunFolder) -> contextlib.AbstractContextManager[None]:
 def _run(
     config: TrainConfig,
     run: RunFolder,
-    expert: TensorDictModuleBase | None,
+    task: Task,
     callbacks: Sequence[Callback],
     checkpoint: Checkpoint | None = None,
     *,
@@ -162,11 +162,10 @@ def _run(
     """Train, from the start or from a checkpoint, and evaluate, which the first process does alone."""
     first = distributed.is_first()
     with GracefulInterrupt().listen() as interrupt, _loggers(config, run) as loggers, _status_of_failure(run):
-        dashboards = [DashboardCallback(config, run, loggers, expert)] if loggers else []
+        dashboards = [DashboardCallback(config, task, run, loggers)] if loggers else []
         context = TrainContext(
             config=distributed.own_part(config, checkpoint.step if checkpoint else 0),
-            make_env=training_env_factory(config.env),
-            expert=Reynolds.for_env(config.env) if expert is None else expert,
+            task=task,
             run=run,
             loggers=loggers,
             callbacks=[*callbacks, *dashboards],
@@ -177,7 +176,7 @@ def _run(
         policies = TRAINERS[config.trainer.name].load()(context)
         distributed.leave()
         if first and evaluate:
-            _evaluate(config, run, policies, loggers, context.config.device, expert)
+            _evaluate(config, run, task, policies, loggers, context.config.device)
         if first:
             run.note_status("finished")
     return run
@@ -186,14 +185,14 @@ def _run(
 def _evaluate(
     config: TrainConfig,
     run: RunFolder,
+    task: Task,
     policies: Mapping[str, ModGNN],
     loggers: LoggerGroup,
     device: str,
-    expert: TensorDictModuleBase | None,
 ) -> None:
     """Evaluate the policies, and show the tables on dashboards."""
     run.note_status("evaluating")
-    tables = evaluate_policies(run, policies, config.env, config.evaluation, device, expert=expert)
+    tables = evaluate_policies(run, policies, task, config.evaluation, device)
     log_evaluation(loggers, tables)
 
 

@@ -7,15 +7,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from modgnn_rl.actions import ActionSpace
+from modgnn_rl.layout import STATE, Layout
 from modgnn_rl.nn.communication import GraphShift
-from modgnn_rl.utils.tensors import clip_to_ball
 
 __all__ = [
     "FEATURES",
     "LATENT",
-    "POSITION_SCALE",
     "VELOCITY_SCALE",
-    "BallHead",
     "LayerSpec",
     "Relative",
     "Scale",
@@ -24,7 +23,6 @@ __all__ = [
     "mlp",
 ]
 
-POSITION_SCALE = 0.5  # 1/m
 VELOCITY_SCALE = 1.4  # s/m
 LATENT = 10  # output width of f_pre and f_mid in the paper
 FEATURES = 16  # output width of layers before the last
@@ -39,23 +37,27 @@ class LayerSpec(NamedTuple):
         earlier: number of earlier layers.
         head: final module of the last layer; None for the layers before it.
         num_agents: N, for models that depend on it.
+        layout: of the observations.
+        width: numbers in an action.
     """
 
     hops: int
     hidden: int
     earlier: int
-    head: nn.Module | None
+    head: ActionSpace | None
     num_agents: int | None
+    layout: Layout
+    width: int
 
     @property
     def inputs(self) -> int:
         """Width of the layer's input: observation and outputs of earlier layers."""
-        return 6 + self.earlier * FEATURES
+        return self.layout.width + self.earlier * FEATURES
 
     @property
     def outputs(self) -> int:
         """Width of the layer's output."""
-        return FEATURES if self.head is None else 3
+        return FEATURES if self.head is None else self.width
 
     def end(self, *f_final: nn.Module) -> nn.Module:
         """The layer's f_final: the given modules, followed by the head in the last layer."""
@@ -63,42 +65,27 @@ class LayerSpec(NamedTuple):
 
     def scales(self) -> list[nn.Module]:
         """One scaling module per hop; the one of hop 0 hides the absolute position."""
-        return [Scale(self.inputs, hide_position=hop == 0) for hop in range(self.hops + 1)]
-
-
-class BallHead(nn.Module):
-    """Projection onto the ball of allowed actions, as in the environment and the expert.
-
-    Args:
-        max_speed: radius of the ball, m/s.
-    """
-
-    is_equivariant = True
-
-    def __init__(self, max_speed: float) -> None:
-        super().__init__()
-        self.max_speed = max_speed
-
-    def forward(self, action: Tensor) -> Tensor:
-        """Project actions [..., 3], m/s."""
-        return clip_to_ball(action, self.max_speed)
+        return [Scale(self.layout, self.inputs, hide_position=hop == 0) for hop in range(self.hops + 1)]
 
 
 class Scale(nn.Module):
-    """Scale positions and velocities to order one; optionally hide the position.
+    """Scale observations to order one; optionally hide the position.
 
     Args:
-        features: width of the data; columns after position and velocity are not changed.
+        layout: says what the columns of the data are, if earlier layers add others after them, too.
+        features: width of the data; default: that of the layout.
         hide_position: return zero positions, for data that contain absolute positions.
     """
 
     is_linear_map = True
     factor: Tensor
 
-    def __init__(self, features: int = 6, *, hide_position: bool = False) -> None:
+    def __init__(self, layout: Layout = STATE, features: int | None = None, *, hide_position: bool = False) -> None:
         super().__init__()
-        factor = torch.ones(features)
-        factor[:3], factor[3:6] = 0.0 if hide_position else POSITION_SCALE, VELOCITY_SCALE
+        factor = torch.ones(features or layout.width)
+        factor[: len(layout.scale)] = torch.tensor(layout.scale)
+        if hide_position:
+            factor[: layout.hidden] = 0.0
         self.register_buffer("factor", factor, persistent=False)
 
     def forward(self, data: Tensor) -> Tensor:
@@ -107,20 +94,23 @@ class Scale(nn.Module):
 
 
 class Relative(nn.Module):
-    """Translation-invariant features of an edge: the difference of its ends, and the receiver without its position.
+    """Features of an edge: the difference of its ends, and the receiver without its position.
+
+    They do not change under translations if the task does not.
 
     Args:
-        features: width of one end F, which begins with position and velocity.
+        layout: says what the first columns of one end are.
+        features: width of one end F.
     """
 
-    def __init__(self, features: int) -> None:
+    def __init__(self, layout: Layout, features: int) -> None:
         super().__init__()
-        self.scale = Scale(features)
+        self.scale, self.hidden = Scale(layout, features), layout.hidden
 
     def forward(self, ends: Tensor) -> Tensor:
-        """Map [E, 2 F] to the scaled difference and the receiver without its position [E, 2 F - 3]."""
+        """Map [E, 2 F] to the scaled difference and the receiver without its position [E, 2 F - D]."""
         sender, receiver = self.scale(ends.unflatten(-1, (2, -1))).unbind(-2)
-        return torch.cat((sender - receiver, receiver[..., 3:]), -1)
+        return torch.cat((sender - receiver, receiver[..., self.hidden :]), -1)
 
 
 class Zero(nn.Module):

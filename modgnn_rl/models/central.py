@@ -23,9 +23,10 @@ class CentralLayer(nn.Module):
 
     Args:
         num_agents: N.
-        features: width of an observation, whose first three columns are the position.
+        features: width of an observation.
         hidden: width of the three hidden layers.
         outputs: width of an agent's output.
+        centred: number of leading columns that are a position, of which the mean over the agents is subtracted.
         scale: applied to the centred observation, a module [*, F] -> [*, F].
         head: applied to each agent's output.
     """
@@ -36,10 +37,18 @@ class CentralLayer(nn.Module):
     intermediate_names = (("f_final",),)
 
     def __init__(
-        self, num_agents: int, features: int, hidden: int, outputs: int, *, scale: nn.Module, head: nn.Module
+        self,
+        num_agents: int,
+        features: int,
+        hidden: int,
+        outputs: int,
+        *,
+        centred: int = 3,
+        scale: nn.Module,
+        head: nn.Module,
     ) -> None:
         super().__init__()
-        self.num_agents, self.outputs = num_agents, outputs
+        self.num_agents, self.outputs, self.centred = num_agents, outputs, centred
         self.scale, self.head = scale, head
         self.network = nn.Sequential(
             *(nn.Linear(num_agents * features, hidden), nn.ReLU()),
@@ -78,8 +87,8 @@ class CentralLayer(nn.Module):
         present = valid if topology.exists is None else valid & topology.exists
         flocks = mask_rows(inputs, present).unflatten(0, (-1, self.num_agents))
         counts = present.view(-1, self.num_agents, 1).sum(1, keepdim=True).clamp(min=1)
-        mean = flocks[..., :3].sum(1, keepdim=True) / counts
-        centred = torch.cat((flocks[..., :3] - mean, flocks[..., 3:]), -1).flatten(0, 1)
+        mean = flocks[..., : self.centred].sum(1, keepdim=True) / counts
+        centred = torch.cat((flocks[..., : self.centred] - mean, flocks[..., self.centred :]), -1).flatten(0, 1)
         features = mask_rows(self.scale(centred), present).view(-1, self.num_agents * centred.shape[-1])
         output = self.head(self.network(features).view(shape.numel(), self.outputs))
         output = mask_rows(output, valid, torch.nan)

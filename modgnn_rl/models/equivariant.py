@@ -188,7 +188,7 @@ def _norm(vector: Tensor) -> Tensor:
 VECTORS, SCALARS = 4, 4  # outputs of pair_force's layers before the last: 3 * 4 + 4 features
 
 
-@MODELS.register("moment_force", layers=2)
+@MODELS.register("moment_force", layers=2, is_physical=True)
 def moment_force(spec: LayerSpec) -> ModGNNLayer:
     """`pair_force` that also reads `Moments` of the neighbours' own neighbourhoods, from the layers before the last.
 
@@ -201,7 +201,7 @@ def moment_force(spec: LayerSpec) -> ModGNNLayer:
     return ModGNNLayer(spec.hops, f_pre=f_pre, f_final=VectorSquash(Moments.vectors))
 
 
-@MODELS.register("pair_force")
+@MODELS.register("pair_force", is_physical=True)
 def pair_force(spec: LayerSpec) -> ModGNNLayer:
     """Equivariant pairwise forces as f_pre, summed over the neighbours: `PairForce`; hop 0 contributes nothing.
 

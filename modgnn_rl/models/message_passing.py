@@ -32,15 +32,17 @@ def mpnn(spec: LayerSpec) -> ModGNNLayer:
     """Message passing: a learned network of sender and receiver as f_com."""
     f_com: list[nn.Module] = []
     for hop in range(1, spec.hops + 1):
-        width = 2 * spec.inputs - 3 if hop == 1 else 2 * spec.hidden
+        width = 2 * spec.inputs - spec.layout.hidden if hop == 1 else 2 * spec.hidden
         network = mlp(width, spec.hidden, spec.hidden)
-        f_com.append(MessagePassing(nn.Sequential(Relative(spec.inputs), network) if hop == 1 else network))
+        f_com.append(
+            MessagePassing(nn.Sequential(Relative(spec.layout, spec.inputs), network) if hop == 1 else network)
+        )
     return _networks_of_hops(spec, f_com)
 
 
 def _networks_of_hops(spec: LayerSpec, f_com: list[nn.Module]) -> ModGNNLayer:
     """A layer whose f_com outputs ``hidden`` features, with networks as f_mid and f_final."""
-    f_pre = [Scale(spec.inputs, hide_position=True), *[None] * spec.hops]
+    f_pre = [Scale(spec.layout, spec.inputs, hide_position=True), *[None] * spec.hops]
     f_mid = [mlp(spec.inputs if hop == 0 else spec.hidden, spec.hidden, LATENT) for hop in range(spec.hops + 1)]
     f_final = spec.end(mlp(LATENT, spec.hidden, spec.outputs))
     return ModGNNLayer(spec.hops, f_com=f_com, f_pre=f_pre, f_mid=f_mid, f_final=f_final)

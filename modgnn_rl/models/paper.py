@@ -69,4 +69,12 @@ def central(spec: LayerSpec) -> CentralLayer:
         raise InputError("model 'central' reads all agents at once: give num_agents")
     if spec.head is None or spec.earlier:
         raise InputError("model 'central' has one layer; give layers=1")
-    return CentralLayer(spec.num_agents, 6, spec.hidden, 3, scale=Scale(), head=spec.head)
+    return CentralLayer(
+        spec.num_agents,
+        spec.inputs,
+        spec.hidden,
+        spec.outputs,
+        centred=spec.layout.hidden,
+        scale=Scale(spec.layout),
+        head=spec.head,
+    )

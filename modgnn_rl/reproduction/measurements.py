@@ -11,16 +11,16 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
-from modgnn_rl.configs.schema import FlockingConfig, ReproduceConfig
+from modgnn_rl.configs.schema import ReproduceConfig
 from modgnn_rl.data.dataset import EpisodeDataset
-from modgnn_rl.envs.flocking.expert import LocalReynolds
-from modgnn_rl.envs.flocking.metrics import action_error
-from modgnn_rl.evaluation.rollout import EpisodeMetrics, reference_policies, rollout
+from modgnn_rl.evaluation.metrics import action_error
+from modgnn_rl.evaluation.rollout import EpisodeMetrics, rollout
 from modgnn_rl.nn.modgnn import ModGNN
-from modgnn_rl.registry import METRICS
 from modgnn_rl.reproduction.jobs import JobResults, Result
 from modgnn_rl.reproduction.studies import EvalSetting, ModelVariant, Study
+from modgnn_rl.task import ACTION, EXPERT_ACTION, Task, make_task
 from modgnn_rl.tracking.loading import load_policy
 from modgnn_rl.trainers.imitation.loss import imitation_loss
 from modgnn_rl.utils.progress import Progress
@@ -63,13 +63,14 @@ def evaluate_variant(
 
 def evaluate_references(config: ReproduceConfig, setting: EvalSetting, done: Mapping[str, Result]) -> Result:
     """Roll out the reference policies in an evaluation setting; their metrics by name of the policy."""
-    policies = reference_policies(_changed(config, setting))
+    policies = _task(config, setting).reference_policies()
     with Progress(f"references in {setting.name}", len(policies) * setting.flocks * setting.steps) as progress:
         return {name: _evaluate(policy, config, setting, progress) for name, policy in policies.items()}
 
 
-def _changed(config: ReproduceConfig, setting: EvalSetting) -> FlockingConfig:
-    return dataclasses.replace(config.env, num_agents=setting.num_agents, **setting.changes)
+def _task(config: ReproduceConfig, setting: EvalSetting) -> Task:
+    task: Task = make_task(dataclasses.replace(config.env, num_agents=setting.num_agents, **setting.changes))
+    return task
 
 
 def _evaluate(
@@ -78,7 +79,7 @@ def _evaluate(
     """Metrics of rollouts from the same initial states for all policies and seeds."""
     rollouts = rollout(
         policy,
-        _changed(config, setting),
+        _task(config, setting),
         num_agents=setting.num_agents,
         num_flocks=setting.flocks,
         steps=setting.steps,
@@ -90,7 +91,7 @@ def _evaluate(
 
 
 def _figures(rollouts: EpisodeMetrics) -> Result:
-    figures = {name: rollouts[name].double() for name in METRICS}
+    figures = {name: rollouts[name].double() for name in rollouts.values}
     for name in SPREADS:
         squares = rollouts.mean_squares[name]
         figures[f"{name}_square"] = squares
@@ -126,18 +127,25 @@ def validate_variant(
 @torch.no_grad()
 def validate_references(config: ReproduceConfig, folder: Path, done: Mapping[str, Result]) -> Result:
     """The error of each reference policy at the states of expert episodes, one value per episode."""
-    policies = reference_policies(config.env)
+    task = make_task(config.env)
+    policies = task.reference_policies()
     errors: dict[str, list[float]] = {name: [] for name in policies}
     for windows in _validation_windows(config, folder, 2):
         now = windows[:, -1]
         for name, policy in policies.items():
-            seen = now.copy()
-            if isinstance(policy, LocalReynolds):
-                seen[policy.cache] = windows["agents", "observation"][:, 0]
-            agents = policy(seen)["agents"]
-            error = action_error(agents["action"], now["agents", "expert_action"], now["agents", "controlled"])
-            errors[name].append(float(error.mean()))
+            action = _last_action(policy, windows)
+            difference = task.actions.difference(action, now[EXPERT_ACTION])
+            errors[name].append(float(action_error(difference, now["agents", "controlled"]).mean()))
     return {name: {"error": _rounded(values)} for name, values in errors.items()}
+
+
+def _last_action(policy: TensorDictModuleBase, windows: TensorDict) -> Tensor:
+    """The action of a policy, whose state begins empty, at the end of windows [S, W]."""
+    state = TensorDict({}, [len(windows)])
+    for step in range(windows.shape[1]):
+        now = policy(windows[:, step].copy().update(state))
+        state = now.get("next", state)
+    return now[ACTION]
 
 
 class Results:

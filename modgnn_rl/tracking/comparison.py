@@ -70,11 +70,12 @@ def _training(runs: Sequence[RunSummary]) -> list[list[str]]:
         ["speed", *(f"{format_value(run.speed)} {run.unit}/s" if run.speed else MISSING for run in runs)],
     ]
     for metric in training_metrics():
+        title = heading(metric, runs[0].task)
         best = [run.best if run.objective == metric else None for run in runs]
         rows += [
-            [f"{heading(metric)}: last", *(format_value(run.last.get(metric)) for run in runs)],
-            [f"{heading(metric)}: mean of the last 5", *(format_value(run.recent.get(metric)) for run in runs)],
-            [f"{heading(metric)}: best mean of 5", *map(format_value, best)],
+            [f"{title}: last", *(format_value(run.last.get(metric)) for run in runs)],
+            [f"{title}: mean of the last 5", *(format_value(run.recent.get(metric)) for run in runs)],
+            [f"{title}: best mean of 5", *map(format_value, best)],
         ]
     return [row for row in rows if set(row[1:]) != {MISSING}]
 
@@ -94,13 +95,15 @@ def _evaluation(runs: Sequence[RunSummary]) -> list[list[str]]:
         rows.append(
             [flock, *(f"{row['num_flocks']} episodes of {row['steps']} steps" if row else MISSING for row in found)]
         )
-        rows += [[heading(metric), *(_mean(row and row[metric]) for row in found)] for metric in METRICS]
+        metrics = [name for name in METRICS if any(row and row.get(name) for row in found)]
+        task = next(run.task for run in runs if flock in run.evaluations)
+        rows += [[heading(metric, task), *(_mean(row and row.get(metric)) for row in found)] for metric in metrics]
     return rows
 
 
 def _mean(entry: dict[str, float] | None) -> str:
     """Mean [confidence interval], or a fraction in percent."""
-    if entry is None:
+    if not entry:
         return MISSING
     return "{mean:.3g} [{low:.3g}, {high:.3g}]".format(**entry) if "low" in entry else f"{entry['mean']:.0%}"
 

@@ -9,15 +9,17 @@ import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from modgnn_rl.configs.schema import FlockingConfig, ModelConfig
+from modgnn_rl.configs.schema import ModelConfig, TaskConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.factory import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.registry import TASKS
+from modgnn_rl.task import Task, make_task
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.tracking.run_folder import RunFolder
 
-__all__ = ["load_env_config", "load_policy", "override_env_config", "stored_model"]
+__all__ = ["changed_task", "load_env_config", "load_policy", "load_task", "stored_model"]
 
 
 def load_policy(
@@ -25,7 +27,7 @@ def load_policy(
     *,
     device: torch.device | str = "cpu",
     which: str = "last",
-    env_config: FlockingConfig | None = None,
+    task: Task | None = None,
 ) -> ModGNN:
     """Load the policy of a run.
 
@@ -33,7 +35,7 @@ def load_policy(
         run: a run folder, or its path ``runs/<date>-<name>``.
         device: device of the policy.
         which: ``last``: the latest; or ``best``: the one with the best score in training.
-        env_config: environment config of the run, if it is loaded already.
+        task: task of the run, if it is loaded already.
 
     Returns:
         the policy, a TensorDictModule for flocks of any size, in evaluation mode.
@@ -43,7 +45,7 @@ def load_policy(
     """
     run = run if isinstance(run, RunFolder) else RunFolder.open(run)
     model = stored_model(run)
-    policy = configured_model(model, env_config or load_env_config(run), seed=0)
+    policy = configured_model(model, task or load_task(run), seed=0)
     checkpoint = load_checkpoint(run.best if which == "best" else run.checkpoints, groups=("policy",))
     try:
         policy.load_state_dict(checkpoint.tensors["policy"])
@@ -65,35 +67,51 @@ def stored_model(run: RunFolder) -> ModelConfig:
     return model
 
 
-def load_env_config(run: RunFolder) -> FlockingConfig:
-    """The environment config of a run.
+def load_task(run: RunFolder) -> Task:
+    """The task of a run, with its settings.
 
     Raises:
-        InputError: its configuration is damaged.
+        InputError: its configuration is damaged, or the task is not known here.
     """
-    env_config: FlockingConfig = _stored(run, "env", FlockingConfig)
-    return env_config
+    task: Task = make_task(load_env_config(run))
+    return task
 
 
-def override_env_config(env_config: FlockingConfig, overrides: Any) -> tuple[FlockingConfig, dict[str, Any]]:
-    """Change some settings of an environment.
+def load_env_config(run: RunFolder) -> Any:
+    """The settings of a run's task.
+
+    Raises:
+        InputError: its configuration is damaged, or the task is not known here.
+    """
+    name = (run.config.get("env") or {}).get("name")
+    if name is None:
+        raise InputError(
+            f"{run.path / 'config.yaml'} does not name the task, env.name; restore it as training wrote it"
+        )
+    return _stored(run, "env", TASKS[str(name)].option("settings", TaskConfig))
+
+
+def changed_task(task: Task, overrides: Any) -> tuple[Task, dict[str, Any]]:
+    """Change some settings of a task.
 
     Args:
-        env_config: environment config, such as that of a run.
-        overrides: a `modgnn_rl.configs.schema.EnvOverrides`; its settings that are None stay as they are.
+        task: such as that of a run.
+        overrides: an instance of what `modgnn_rl.configs.settings.overrides_of` makes of the task's settings; those
+            that are None stay as they are.
 
     Returns:
-        the changed environment config, and by name the settings that it changes.
+        the changed task, and by name the settings that it changes.
 
     Raises:
-        InputError: a value of the wrong kind.
+        InputError: the task has no such setting, or a value is of the wrong kind.
     """
     changed = {name: value for name, value in vars(overrides).items() if value is not None}
     try:
-        found: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(env_config), changed))
+        found: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(task.config), changed))
     except OmegaConfBaseException as error:
         raise InputError(f"env.{error.full_key}: {str(error.msg).splitlines()[0]}") from error
-    return found, changed
+    check(found, "env")
+    return make_task(found), changed
 
 
 def _stored(run: RunFolder, group: str, schema: type) -> Any:

@@ -80,6 +80,11 @@ class RunSummary:
     policies: tuple[RunSummary, ...] = ()
 
     @property
+    def task(self) -> str:
+        """Name of the task; empty if the configuration does not say."""
+        return str(as_dict(self.config.get("env")).get("name", ""))
+
+    @property
     def sizes(self) -> list[Any]:
         """The numbers of agents in training."""
         return as_list(as_dict(self.config.get("env")).get("num_agents"))

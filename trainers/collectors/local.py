@@ -25,8 +25,9 @@ class RolloutSpec:
     """Which rollouts a collector collects.
 
     Attributes:
-        make_env: task; ``make_env(num_envs, num_agents, seed, device)`` returns a TorchRL environment [B] with the
-            attribute ``generators`` (random generators by name) and the methods ``snapshot`` and ``restore``.
+        make_env: ``make_env(num_envs, num_agents, seed, device)`` returns a TorchRL environment [B], such as
+            `modgnn_rl.task.Task.training_env`. It has the attribute ``generators`` (random generators by name), and
+            the methods ``snapshot`` and ``restore`` unless its attribute ``has_snapshots`` is false.
         num_envs: environments that run in parallel, B.
         num_agents: agents in each, N.
         steps: steps of each call of `LocalCollector.collect`, T.
@@ -79,7 +80,12 @@ class LocalCollector:
         return {**self.env.generators, "noise": self.noise}
 
     def state(self) -> tuple[TensorGroups, dict[str, Any]]:
-        """The state of the rollouts for a checkpoint, without generators: tensors and plain values."""
+        """The state of the rollouts for a checkpoint, without generators: tensors and plain values.
+
+        It is empty if the environment has no snapshots; a resumed run then begins new episodes.
+        """
+        if not getattr(self.env, "has_snapshots", True):
+            return {}, {}
         # The messages are carried from step to step; the trajectory ids of TorchRL need not be restored.
         carried = collector_carrier(self.collector).exclude("collector").flatten_keys("/")
         return {"env": self.env.snapshot(), "carried": dict(carried.items())}, {}
@@ -90,6 +96,8 @@ class LocalCollector:
         Raises:
             KeyError, RuntimeError: the state is that of other environments.
         """
+        if not getattr(self.env, "has_snapshots", True):
+            return
         self.env.restore(tensors["env"])
         carrier = collector_carrier(self.collector)
         restored = TensorDict(tensors["carried"], carrier.batch_size, device=self.env.device).unflatten_keys("/")

@@ -14,8 +14,9 @@ from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRo
 
 from modgnn_rl.configs.schema import REFERENCE_SIZE, CollectorConfig, ImitationConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.task import Task
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, Ensemble, SafetyGate, ensemble_std
-from modgnn_rl.trainers.collectors.local import EnvFactory, RolloutSpec
+from modgnn_rl.trainers.collectors.local import RolloutSpec
 from modgnn_rl.trainers.collectors.remote import make_collector
 from modgnn_rl.trainers.collectors.windows import reservoir_indices, slice_windows, window_length
 from modgnn_rl.trainers.common.state import TensorGroups
@@ -238,9 +239,8 @@ def make_buffer(
 
 def make_buffers(
     config: TrainConfig,
-    make_env: EnvFactory,
+    task: Task,
     policies: Sequence[ModGNN],
-    expert: TensorDictModuleBase,
     *,
     steps: int,
     hold_steps: int,
@@ -249,10 +249,10 @@ def make_buffers(
     """The buffers of a training run, by number of agents; see `make_buffer`."""
     return {
         size: make_buffer(
-            training_spec(config, make_env, size, steps),
+            training_spec(config, task, size, steps),
             config.trainer,
             policies,
-            expert,
+            task.teacher,
             hold_steps=hold_steps,
             gate=gate,
             collector=config.collector,
@@ -263,9 +263,8 @@ def make_buffers(
 
 def make_validation_buffers(
     config: TrainConfig,
-    make_env: EnvFactory,
+    task: Task,
     policies: Sequence[ModGNN],
-    expert: TensorDictModuleBase,
     *,
     steps: int,
     hold_steps: int,
@@ -277,13 +276,13 @@ def make_validation_buffers(
         seed=derive_seed(config.seed, "validation"),
         collector=CollectorConfig(),
     )
-    return make_buffers(validation, make_env, policies, expert, steps=steps, hold_steps=hold_steps)
+    return make_buffers(validation, task, policies, steps=steps, hold_steps=hold_steps)
 
 
-def training_spec(config: TrainConfig, make_env: EnvFactory, size: int, steps: int) -> RolloutSpec:
+def training_spec(config: TrainConfig, task: Task, size: int, steps: int) -> RolloutSpec:
     """The rollouts of a training run with ``size`` agents, ``steps`` steps at a time."""
     num_envs, seed = num_envs_of_size(config, size), derive_seed(config.seed, "flocks", size)
-    return RolloutSpec(make_env, num_envs, size, steps, seed, config.device)
+    return RolloutSpec(task.training_env, num_envs, size, steps, seed, config.device)
 
 
 def num_envs_of_size(config: TrainConfig, size: int) -> int:

@@ -67,14 +67,14 @@ class _ExpertRollouts:
     """
 
     def __init__(self, context: TrainContext, policies: Sequence[ModGNN], rounds: int) -> None:
-        config, make_env, expert = context.config, context.make_env, context.expert
+        config, task = context.config, context.task
         self.settings: BCConfig = config.trainer
         self.parts = DART_PARTS if self.settings.dart else 1
         self.starts = [part * rounds // self.parts for part in range(self.parts)]  # rounds before each part
         steps = max(1, self.settings.cloning_steps // self.parts)
         options: dict[str, Any] = {"steps": steps, "hold_steps": self.settings.cloning_steps}
-        self.validation = make_validation_buffers(config, make_env, policies, expert, **options)
-        self.training = make_buffers(config, make_env, policies, expert, **options)
+        self.validation = make_validation_buffers(config, task, policies, **options)
+        self.training = make_buffers(config, task, policies, **options)
 
     def collect(self, loop: TrainingLoop) -> dict[str, float]:
         """Let the expert act where a part starts, and in any case if there are no data yet."""

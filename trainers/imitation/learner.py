@@ -17,6 +17,7 @@ from torchrl.data import ReplayBuffer
 from modgnn_rl.configs.schema import ImitationConfig
 from modgnn_rl.models.blocks import is_equivariant
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.task import EXPERT_ACTION, OBSERVATION, Task
 from modgnn_rl.trainers.collectors.windows import have_same_architecture
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.optimization import GuardedOptimizer
@@ -35,6 +36,7 @@ class ImitationLearner:
 
     Args:
         policy: the policy to train.
+        task: says what observations and actions are.
         settings: how.
         updates: updates until the first cosine of the learning rate ends, and of the whole run.
         seed: seeds the choice of agents and the augmentations.
@@ -43,8 +45,10 @@ class ImitationLearner:
         updates_done: number of optimiser steps so far, skipped ones included.
     """
 
-    def __init__(self, policy: ModGNN, settings: ImitationConfig, updates: tuple[int, int], seed: int) -> None:
-        self.policy, self.settings = policy, settings
+    def __init__(
+        self, policy: ModGNN, task: Task, settings: ImitationConfig, updates: tuple[int, int], seed: int
+    ) -> None:
+        self.policy, self.task, self.settings = policy, task, settings
         self.averaged = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.ema_decay))
         self.generator = torch.Generator().manual_seed(derive_seed(seed, "learner"))
         self.validation_generator = torch.Generator().manual_seed(derive_seed(seed, "learner", "validation"))
@@ -53,7 +57,7 @@ class ImitationLearner:
             self.optimizer, lambda step: cosine_learning_rate(step, settings.learning_rates, updates)
         )
         self.guarded_optimizer = GuardedOptimizer(policy, self.optimizer, settings)
-        self.rotates = settings.rotate and not is_equivariant(policy)
+        self.rotates = settings.rotate and task.layout.is_rotatable and not is_equivariant(policy)
         self.updates_done = 0
 
     @property
@@ -92,14 +96,14 @@ class ImitationLearner:
         """
         settings = self.settings
         if with_rotation:
-            rotations = random_rotations(len(batch), batch["agents", "observation"], generator)
-            vectors: list[NestedKey] = [("agents", "observation"), ("agents", "expert_action")]
+            rotations = random_rotations(len(batch), self.task.layout, batch[OBSERVATION], generator)
+            vectors: list[NestedKey] = [OBSERVATION, EXPERT_ACTION]
             # Messages of policies that need rotations are in the data only if they are sums of observations.
             vectors += [self.policy.messages_key] if self.policy.messages_key in batch else []
             for key in vectors:
-                batch[key] = rotate(batch[key], rotations)
+                batch[key] = rotate(batch[key], rotations, self.task.layout.vectors if key != EXPERT_ACTION else 1)
         if settings.hide_velocity:
-            hide_velocities(batch, settings.hide_velocity, generator)
+            hide_velocities(batch, self.task.layout, settings.hide_velocity, generator)
         controlled = batch["agents", "controlled"][:, -1]
         return random_receivers(controlled, receivers_per_state(settings, controlled.shape[-1]), generator)
 
@@ -170,9 +174,9 @@ def fit_together(learners: Sequence[ImitationLearner], buffer: ReplayBuffer, upd
         for learner in learners:
             learner.optimizer.zero_grad()
         if alike and batch["agents", "controlled"].numel() * receivers.shape[-1] <= MAX_STACKED_PAIRS:
-            losses = stacked_losses(policies, batch, receivers)
+            losses = stacked_losses(policies, batch, receivers, loss=first.task.actions.loss)
         else:
-            losses = [imitation_loss(policy, batch, receivers) for policy in policies]
+            losses = [imitation_loss(policy, batch, receivers, loss=first.task.actions.loss) for policy in policies]
             for loss in losses:
                 loss.backward()
         for learner, loss in zip(learners, losses, strict=True):
@@ -187,7 +191,8 @@ def validate_together(learners: Sequence[ImitationLearner], buffer: ReplayBuffer
     batch, first = buffer.sample(), learners[0]
     with_rotation = any(learner.rotates for learner in learners)
     receivers = first.prepare(batch, first.validation_generator, with_rotation=with_rotation)
-    losses = [float(imitation_loss(learner.ema_policy, batch, receivers)) for learner in learners]
+    loss = first.task.actions.loss
+    losses = [float(imitation_loss(learner.ema_policy, batch, receivers, loss=loss)) for learner in learners]
     return list(distributed.mean(dict(enumerate(losses))).values())
 
 

@@ -1,17 +1,15 @@
-"""What a trainer is given: settings, expert, callbacks, and where to write and to start from."""
+"""What a trainer is given: settings, task, callbacks, and where to write and to start from."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from tensordict.nn import TensorDictModuleBase
-
 from modgnn_rl.configs.schema import TrainConfig
+from modgnn_rl.task import Task
 from modgnn_rl.tracking.checkpoint import Checkpoint
 from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
-from modgnn_rl.trainers.collectors.local import EnvFactory
 from modgnn_rl.trainers.loop.callbacks import Callback
 from modgnn_rl.utils.signals import GracefulInterrupt
 
@@ -22,13 +20,12 @@ __all__ = ["TrainContext"]
 class TrainContext:
     """One training run.
 
-    A trainer reads `config`, `make_env` and `expert`; the rest is for
+    A trainer reads `config` and `task`; the rest is for
     `modgnn_rl.trainers.loop.training_loop.TrainingLoop`.
 
     Attributes:
         config: all settings, checked; in distributed training those of this process.
-        make_env: creates environments for training; see `modgnn_rl.trainers.collectors.local.RolloutSpec`.
-        expert: labels every state, under ``("agents", "expert_action")``.
+        task: makes environments (``task.training_env``), and labels states (``task.teacher``) if it has an expert.
         run: folder for metrics and checkpoints.
         loggers: where metrics go in addition to ``metrics.jsonl``.
         callbacks: called at the start, after every collection of rollouts, after every round, and at the end.
@@ -38,8 +35,7 @@ class TrainContext:
     """
 
     config: TrainConfig
-    make_env: EnvFactory
-    expert: TensorDictModuleBase
+    task: Task
     run: RunFolder
     loggers: LoggerGroup
     callbacks: Sequence[Callback] = ()

@@ -13,10 +13,11 @@ from tensordict.nn import TensorDictModuleBase
 from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
 from modgnn_rl.errors import one_line
 from modgnn_rl.evaluation.recording import record
-from modgnn_rl.evaluation.rollout import reference_policies, rollout
+from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.metrics import over_flocks
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import METRICS, TRAINERS
+from modgnn_rl.task import Task
 from modgnn_rl.tracking.loggers import LoggerGroup
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.loop.callbacks import Callback
@@ -38,19 +39,19 @@ class DashboardCallback(Callback):
 
     Args:
         config: settings of the run.
+        task: of the run.
         run: the run folder; videos go to its ``videos/``.
         loggers: dashboards to log to.
-        expert: the policy's teacher; default: Reynolds flocking.
     """
 
     def __init__(
         self,
         config: TrainConfig,
+        task: Task,
         run: RunFolder,
         loggers: LoggerGroup,
-        expert: TensorDictModuleBase | None = None,
     ) -> None:
-        self.config, self.run, self.loggers, self.expert = config, run, loggers, expert
+        self.config, self.task, self.run, self.loggers = config, task, run, loggers
         self.policies: Mapping[str, ModGNN] = {}
         self.references: dict[str, dict[str, float]] = {}  # by metric, then by reference policy
         self.shown: set[str] = set()  # metrics with reference lines
@@ -88,7 +89,7 @@ class DashboardCallback(Callback):
 
     @property
     def _makes_videos(self) -> bool:
-        return self.config.video_rounds > 0 and self.loggers.shows_videos
+        return self.config.video_rounds > 0 and self.loggers.shows_videos and self.task.has_positions
 
     @property
     def _steps(self) -> int:
@@ -111,34 +112,34 @@ class DashboardCallback(Callback):
 
     def _roll_out_references(self) -> None:
         """Log a table of the reference policies' metrics for each size, and keep them for the lines."""
-        env_config = self.config.env
-        for size in env_config.sizes:
+        metrics = self.task.metrics
+        for size in self.task.sizes:
             rows = {
-                name: self._reference_metrics(policy, size)
-                for name, policy in reference_policies(env_config, self.expert).items()
+                name: self._reference_metrics(policy, size) for name, policy in self.task.reference_policies().items()
             }
-            for name in METRICS:
+            for name in metrics:
                 self.references[f"{size}/{name}"] = {policy: row[name] for policy, row in rows.items()}
             table: list[list[str | float]] = [[policy, *row.values()] for policy, row in rows.items()]
-            self.loggers.log_table(f"references/{size}", ["policy", *METRICS], table)
-        for name in {entry.option("objective") for entry in TRAINERS.values()} & set(METRICS):
-            lines = [self.references[f"{size}/{name}"] for size in env_config.sizes]
+            self.loggers.log_table(f"references/{size}", ["policy", *metrics], table)
+        for name in {entry.option("objective") for entry in TRAINERS.values()} & set(metrics):
+            lines = [self.references[f"{size}/{name}"] for size in self.task.sizes]
             self.references[name] = {policy: sum(line[policy] for line in lines) / len(lines) for policy in lines[0]}
 
     def _reference_metrics(self, policy: TensorDictModuleBase, size: int) -> dict[str, float]:
         """Metrics of a reference policy, by name; like those of a trainer's rollouts, sums are per step."""
         episodes = rollout(
             policy,
-            self.config.env,
+            self.task,
             num_agents=size,
             num_flocks=max(1, FLOCKS * REFERENCE_SIZE // size),
             steps=self._steps,
             seed=derive_seed(self.config.seed, "references", size),
             device=self.config.device,
-            expert=self.expert,
         )
-        steps = {name: self._steps if entry.options["over_time"] == "sum" else 1 for name, entry in METRICS.items()}
-        return {name: over_flocks(name, episodes[name]) / steps[name] for name in METRICS}
+        is_sum = {name: METRICS[name].options["over_time"] == "sum" for name in self.task.metrics}
+        return {
+            name: over_flocks(name, episodes[name]) / (self._steps if total else 1) for name, total in is_sum.items()
+        }
 
     def _reference_of(self, metric: str) -> str:
         """The name in ``references`` of a metric, whose own name may begin with a policy's."""
@@ -155,17 +156,15 @@ class DashboardCallback(Callback):
 
     def _log_video(self) -> None:
         """Log a video of the first policy at the first size, always from the same start so that videos compare."""
-        env_config, folder = self.config.env, self.run.path / "videos"
-        size = env_config.sizes[0]
+        folder, size = self.run.path / "videos", self.task.sizes[0]
         recording = record(
             next(iter(self.policies.values())),
-            env_config,
+            self.task,
             num_agents=size,
             steps=self._steps,
             seed=derive_seed(self.config.seed, "references", size),
             stride=VIDEO_STRIDE,
             device=self.config.device,
-            expert=self.expert,
         )
         folder.mkdir(exist_ok=True)
         path = folder / f"round_{self.last:05d}.mp4"
@@ -182,9 +181,10 @@ def log_evaluation(loggers: LoggerGroup, tables: Mapping[int, Mapping[str, Any]]
         tables: by number of agents, as `modgnn_rl.evaluation.table.summarise_rollouts` makes them.
     """
     for size, table in tables.items():
+        metrics = [name for name in METRICS if any(name in row for row in table.values())]
         rows: list[list[str | float]] = []
         for policy, row in table.items():
-            cells = {name: row[name] or {} for name in METRICS}
+            cells = {name: row.get(name) or {} for name in metrics}
             values = [cell.get("min", cell.get("mean", math.nan)) for cell in cells.values()]
-            rows.append([policy, *values, *(cells["error"].get(end, math.nan) for end in ("low", "high"))])
-        loggers.log_table(f"evaluation/{size}", ["policy", *METRICS, "error, low", "error, high"], rows)
+            rows.append([policy, *values, *(cells.get("error", {}).get(end, math.nan) for end in ("low", "high"))])
+        loggers.log_table(f"evaluation/{size}", ["policy", *metrics, "error, low", "error, high"], rows)

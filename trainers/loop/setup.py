@@ -5,14 +5,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 
-from tensordict.nn import TensorDictModuleBase
-
 from modgnn_rl.configs.schema import ModelConfig, TrainConfig
-from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.factory import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
+from modgnn_rl.task import Task
 from modgnn_rl.tracking.loading import load_policy, stored_model
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.collectors.remote import check_collector
@@ -21,6 +19,7 @@ from modgnn_rl.trainers.imitation.learner import ImitationLearner
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = [
+    "check_expert",
     "check_steps",
     "check_training",
     "check_updates",
@@ -31,18 +30,19 @@ __all__ = [
 ]
 
 
-def make_learner(config: TrainConfig, updates: tuple[int, int], member: int = 0) -> ImitationLearner:
+def make_learner(config: TrainConfig, task: Task, updates: tuple[int, int], member: int = 0) -> ImitationLearner:
     """The learner of a run, or one of several that differ in their initial weights.
 
     Args:
         config: the run's settings.
+        task: of the run.
         updates: updates until the first cosine of the learning rate ends, and of the whole run.
         member: index of the learner.
     """
-    return ImitationLearner(initial_policy(config, member), config.trainer, updates, config.seed)
+    return ImitationLearner(initial_policy(config, task, member), task, config.trainer, updates, config.seed)
 
 
-def initial_policy(config: TrainConfig, member: int = 0) -> ModGNN:
+def initial_policy(config: TrainConfig, task: Task, member: int = 0) -> ModGNN:
     """The policy that a run starts from, on its device: that of another run, or a new one of ``config.model``.
 
     Raises:
@@ -51,7 +51,7 @@ def initial_policy(config: TrainConfig, member: int = 0) -> ModGNN:
     if config.init_from is not None:
         return load_policy(config.init_from, device=config.device).train()
     role = ("model", member) if member else ("model",)
-    return configured_model(config.model, config.env, derive_seed(config.seed, *role)).to(config.device)
+    return configured_model(config.model, task, derive_seed(config.seed, *role)).to(config.device)
 
 
 def members_of(config: TrainConfig) -> dict[str, TrainConfig]:
@@ -60,13 +60,12 @@ def members_of(config: TrainConfig) -> dict[str, TrainConfig]:
     return {config.model.name: config} if members is None else members(config)
 
 
-def resolve_model(config: TrainConfig) -> TrainConfig:
-    """The settings with the model that is trained: that of ``init_from``, or that of the first of several policies.
+def resolve_model(config: TrainConfig, task: Task) -> TrainConfig:
+    """The settings with the model that is trained: that of ``init_from``, that of the first of several, or the task's.
 
     Raises:
         InputError: no readable run ``config.init_from``, or it has another model than the settings name.
     """
-    model = next(iter(members_of(config).values())).model
     if config.init_from is not None:
         model = stored_model(RunFolder.open(config.init_from))
         if config.model not in (model, ModelConfig()):
@@ -74,43 +73,52 @@ def resolve_model(config: TrainConfig) -> TrainConfig:
                 f"model={config.model} is not that of init_from={config.init_from}, {model}; leave the model out, it "
                 "is taken from there"
             )
-    return dataclasses.replace(config, model=model)
+        return dataclasses.replace(config, model=model)
+    named = dataclasses.replace(config.model, name=config.model.name or task.default_model)
+    config = dataclasses.replace(config, model=named)
+    return dataclasses.replace(config, model=next(iter(members_of(config).values())).model)
 
 
-def check_training(config: TrainConfig, expert: TensorDictModuleBase | None = None) -> None:
+def check_training(config: TrainConfig, task: Task) -> None:
     """Refuse what the ranges of single settings do not, before anything is created.
 
     Args:
         config: the settings, with the model resolved.
-        expert: what `modgnn_rl.experiment.training.train` was given.
+        task: of the run.
 
     Raises:
         InputError: sizes that repeat or have no agent to train, a model without parameters, several policies that would
             start with the same weights, agents that do not fit into the ball they start in, workers that cannot be
             used, or what the trainer itself refuses (its option ``check``).
     """
-    sizes = config.env.sizes
-    if len(set(sizes)) != len(sizes) or min(sizes) < 2:
-        raise InputError(
-            f"env.num_agents={sizes} must list each size once, and none below 2: the leader is not trained"
-        )
+    sizes = task.sizes
+    if len(set(sizes)) != len(sizes) or min(sizes) < task.min_agents:
+        raise InputError(f"env.num_agents={sizes} must list each number once, and none below {task.min_agents}")
     members = list(members_of(config).values())
     if config.init_from is not None and len(members) > 1:
         raise InputError(
             "several policies cannot all start from that of init_from, they would stay equal: leave it out, or train "
             "one policy"
         )
-    policies = [initial_policy(member) for member in members]
+    policies = [initial_policy(member, task) for member in members]
     for member, policy in zip(members, policies, strict=True):
         if not list(policy.parameters()):
             raise InputError(f"model.name={member.model.name} with model.hops={member.model.hops} has nothing to learn")
     check = TRAINERS[config.trainer.name].option("check")
     if check is not None:
-        check(config, policies, expert)
+        check(config, policies, task)
     for size in sizes:
         check_collector(config.collector, num_envs_of_size(config, size))
-        with contextlib.closing(FlockingEnv(1, size, config=config.env, seed=config.seed)) as env:
+        with contextlib.closing(task.training_env(1, size, config.seed, "cpu")) as env:
             env.reset()
+
+
+def check_expert(task: Task, trainer: str) -> None:
+    """Refuse a trainer that imitates, for a task without an expert."""
+    if task.teacher is None:
+        raise InputError(
+            f"trainer={trainer} imitates an expert, which task '{task.name}' does not have; use trainer=mappo"
+        )
 
 
 def check_updates(config: TrainConfig, name: str) -> None:

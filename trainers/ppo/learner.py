@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
@@ -16,13 +15,14 @@ from torchrl.objectives import ValueEstimators
 
 from modgnn_rl.configs.schema import MAPPOConfig
 from modgnn_rl.nn.modgnn import ModGNN
+from modgnn_rl.task import Task
 from modgnn_rl.trainers.collectors.windows import slice_windows
 from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.optimization import GuardedOptimizer
 from modgnn_rl.trainers.common.sampling import random_receivers, receivers_per_state
 from modgnn_rl.trainers.common.state import TensorGroups, optimizer_state, restore_optimizer
 from modgnn_rl.trainers.ppo.actor import GaussianActor
-from modgnn_rl.trainers.ppo.critic import FlockCritic
+from modgnn_rl.trainers.ppo.critic import CentralCritic
 from modgnn_rl.trainers.ppo.loss import MASK, REFERENCE_ACTION, KLPenaltyMAPPOLoss, SharedValueNorm
 from modgnn_rl.utils.seeds import derive_seed, seeded
 
@@ -45,8 +45,8 @@ class PPOLearner:
 
     Args:
         policy: the policy to train; a frozen copy is the reference policy of the KL penalty.
+        task: says what actions are and what the critic sees.
         settings: how.
-        state: key of the true states [*B, N, 6], which the critic sees.
         seed: seeds the order of batches and the choice of agents.
 
     Attributes:
@@ -56,7 +56,7 @@ class PPOLearner:
         updates_done: number of optimiser steps so far, skipped ones included.
     """
 
-    def __init__(self, policy: ModGNN, settings: MAPPOConfig, state: NestedKey, seed: int) -> None:
+    def __init__(self, policy: ModGNN, task: Task, settings: MAPPOConfig, seed: int) -> None:
         self.settings, self.policy = settings, policy
         self.reference_policy = copy.deepcopy(policy).requires_grad_(False)
         self.averaged = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.ema_decay))
@@ -65,7 +65,7 @@ class PPOLearner:
         self.order = torch.Generator(device).manual_seed(derive_seed(seed, "order"))
         self.actor = GaussianActor(policy, settings.noise).to(device)
         with seeded(derive_seed(seed, "critic")):
-            self.critic = FlockCritic(state, hidden=settings.critic_hidden).to(device)
+            self.critic = CentralCritic(task.critic_input(), hidden=settings.critic_hidden).to(device)
         self.loss = make_loss(self.actor, self.critic, settings)
         groups = [
             {"params": list(self.actor.parameters()), "lr": settings.learning_rate},
@@ -132,7 +132,7 @@ class PPOLearner:
         """Rollouts [B, T] as a buffer, every pass over which yields minibatches of windows [S, W] in random order."""
         names = ("controlled", "action", "action_log_prob", "advantage", "value_target")
         agents = [("agents", name) for name in names]
-        kept = [*self.policy.in_keys, *agents, self.critic.state_key, REFERENCE_ACTION]
+        kept = [*self.policy.in_keys, *agents, *self.critic.in_keys, REFERENCE_ACTION]
         windows = slice_windows(rollouts.select(*kept, strict=False), self.window, self.window - self.burn_in)
         buffer = ReplayBuffer(
             storage=LazyTensorStorage(len(windows), device=self.device, compilable=True),
@@ -193,8 +193,8 @@ class PPOLearner:
         self.updates_done = int(values["updates"])
 
 
-def make_loss(actor: GaussianActor, critic: FlockCritic, settings: MAPPOConfig) -> KLPenaltyMAPPOLoss:
-    """The loss, with the keys of the flocking environment and an estimator of advantages (multi-agent GAE)."""
+def make_loss(actor: GaussianActor, critic: CentralCritic, settings: MAPPOConfig) -> KLPenaltyMAPPOLoss:
+    """The loss, with the keys of `modgnn_rl.task_env.TaskEnv` and an estimator of advantages (multi-agent GAE)."""
     loss = KLPenaltyMAPPOLoss(
         actor,
         critic,

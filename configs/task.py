@@ -1,0 +1,27 @@
+"""Settings that all tasks share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from omegaconf import MISSING
+
+from modgnn_rl.configs.settings import as_list, setting
+from modgnn_rl.registry import TASKS
+
+__all__ = ["TaskConfig"]
+
+
+@dataclass
+class TaskConfig:
+    """Settings that all tasks share; a task derives its own from them, see `modgnn_rl.task.Task`."""
+
+    name: str = setting(MISSING, "task", choices=TASKS)
+    num_agents: Any = setting(8, "agents; a list trains on several numbers at once", ge=1, whole=True)
+    max_steps: int = setting(200, "steps after which an episode is truncated", ge=1)
+
+    @property
+    def sizes(self) -> list[int]:
+        """``num_agents`` as a list."""
+        return as_list(self.num_agents)
