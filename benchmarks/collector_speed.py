@@ -18,7 +18,7 @@ from importlib.metadata import version
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
 from modgnn_rl.trainers.collectors.remote import RemoteCollector, make_collector
 from modgnn_rl.utils.device import prepare_torch
@@ -29,7 +29,7 @@ REPETITIONS = 5
 
 def make(name: str, physics: str) -> LocalCollector | RemoteCollector:
     """A collector by name."""
-    spec = RolloutSpec(training_env_factory(FlockingConfig(physics=physics)), FLOCKS, AGENTS, STEPS, seed=0)
+    spec = RolloutSpec(FlockingTask(FlockingConfig(physics=physics)).training_env, FLOCKS, AGENTS, STEPS, seed=0)
     behaviour = (make_model("moment_force", seed=0), Reynolds())
     return make_collector(spec, behaviour, CollectorConfig(name, workers=WORKERS))
 

@@ -20,7 +20,7 @@ from torchrl.data import ReplayBuffer
 from modgnn_rl import ModGNN, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.trainers.collectors.local import RolloutSpec
 from modgnn_rl.trainers.collectors.rollout_buffer import make_buffer
 from modgnn_rl.trainers.imitation.learner import ImitationLearner
@@ -52,7 +52,7 @@ def interleaved(runs: Mapping[str, Callable[[], object]]) -> dict[str, float]:
 
 def collected(policies: list[ModGNN], settings: DAggerConfig, num_agents: int = 32) -> ReplayBuffer:
     """Data for these policies, from rollouts of the expert."""
-    spec = RolloutSpec(training_env_factory(FlockingConfig()), 16, num_agents, steps=40, seed=0)
+    spec = RolloutSpec(FlockingTask(FlockingConfig()).training_env, 16, num_agents, steps=40, seed=0)
     data = make_buffer(spec, settings, policies, Reynolds(), hold_steps=40)
     data.extend(data.collect(beta=1.0))
     data.close()
@@ -64,7 +64,9 @@ def updates() -> None:
     runs = {}
     for name, layers, batch, receivers in UPDATES:
         settings = DAggerConfig(batch_size=batch, agents_per_state=receivers, capacity=2000)
-        learner = ImitationLearner(make_model(name, layers=layers, seed=0), settings, (100, 100), seed=0)
+        learner = ImitationLearner(
+            make_model(name, layers=layers, seed=0), FlockingTask(FlockingConfig()), settings, (100, 100), seed=0
+        )
         data = collected([learner.ema_policy], settings)
         runs[f"{name}, {layers} layer(s), {batch} x {receivers}"] = functools.partial(learner.fit, data, 1)
     times = interleaved(runs)

@@ -52,7 +52,7 @@ CHECKPOINT_HELP = "policy to load: the last one, or the best one seen during tra
 class ModelConfig:
     """The policy: one of the models in `modgnn_rl.models`."""
 
-    name: str | None = setting(None, "model; null: the task's default", choices=MODELS)
+    name: Any = setting(None, "model; null: the task's default", choices=MODELS)
     hops: int = setting(1, "communication hops K per layer", ge=0)
     layers: int | None = setting(
         None, "layers L; the receptive field is L x K hops; null: the model's own default", ge=1

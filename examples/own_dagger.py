@@ -27,6 +27,7 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.envs.flocking.metrics import min_distance
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, SafetyGate, disagreement
 from modgnn_rl.trainers.collectors.windows import slice_windows
@@ -88,7 +89,9 @@ def main(
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
-        test = rollout(policy, env_config, num_agents=num_agents, num_flocks=8, steps=test_steps, seed=1_000_000)
+        test = rollout(
+            policy, FlockingTask(env_config), num_agents=num_agents, num_flocks=8, steps=test_steps, seed=1_000_000
+        )
         errors.append(test["error"].mean().item())
         fraction = rollouts["expert_acts"].float().mean().item()
         print(f"round {len(errors)}: the expert acted in {fraction:4.0%} of steps, then error {errors[-1]:.4f} m²/s²")

@@ -22,9 +22,10 @@ from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import ModGNN, ModGNNLayer
+from modgnn_rl.actions import Ball
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.models.blocks import BallHead, Zero
+from modgnn_rl.models.blocks import Zero
 
 MAX_SPEED = 0.92  # m/s
 
@@ -87,7 +88,7 @@ def main(
         gains, and error of the policy's actions on its own rollouts, m²/s², for each range.
     """
     results = {}
-    head = BallHead(MAX_SPEED)
+    head = Ball(MAX_SPEED, 3)
     print("hears, m   cohesion   separation   alignment   error on its own rollouts, m²/s²")
     for comm_range in comm_ranges:
         f_com = Force()

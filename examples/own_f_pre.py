@@ -20,9 +20,10 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import TransformedEnv, UnaryTransform
 
 from modgnn_rl import ModGNN, ModGNNLayer
+from modgnn_rl.actions import Ball
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.models.blocks import BallHead, Scale
+from modgnn_rl.models.blocks import Scale
 
 
 class RoleForce(nn.Module):
@@ -47,7 +48,7 @@ def make_policy(hidden: int = 32) -> ModGNN:
     """One hop of forces, beside hop 0, which sees the agent's own velocity only."""
     own_velocity = nn.Sequential(Scale(hide_position=True), nn.Linear(6, 3))
     force = TensorDictModule(RoleForce(hidden), in_keys=["data", ("own", "role")], out_keys=["force"])
-    return ModGNN(ModGNNLayer(hops=1, f_pre=[own_velocity, force], f_final=BallHead(max_speed=0.92)))
+    return ModGNN(ModGNNLayer(hops=1, f_pre=[own_velocity, force], f_final=Ball(0.92, 3)))
 
 
 def make_expert() -> TensorDictSequential:

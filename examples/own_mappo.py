@@ -22,8 +22,9 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.rewards import flocking_costs, flocking_reward
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.trainers.ppo.actor import GaussianActor
-from modgnn_rl.trainers.ppo.critic import FlockCritic
+from modgnn_rl.trainers.ppo.critic import CentralCritic
 from modgnn_rl.trainers.ppo.loss import KLPenaltyMAPPOLoss
 from modgnn_rl.utils.tensors import pair_distances
 
@@ -59,7 +60,10 @@ def main(
 ) -> list[float]:
     """Train a policy; returns the mean reward per step in each round, before its updates."""
     torch.manual_seed(seed)
-    actor, critic = GaussianActor(make_model("pair_force"), noise=0.3), FlockCritic()
+    actor, critic = (
+        GaussianActor(make_model("pair_force"), noise=0.3),
+        CentralCritic(FlockingTask(FlockingConfig()).critic_input()),
+    )
     # An action lasts 1/12 s here, so that it has an effect within a few steps.
     env_config = FlockingConfig(max_steps=steps, control_frequency=12.0, physics_substeps=20)
     env = TransformedEnv(FlockingEnv(num_envs, num_agents, config=env_config, seed=seed), OwnReward())

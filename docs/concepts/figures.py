@@ -27,7 +27,9 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl import ModGNN, load_policy, make_model
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, EvaluationConfig, FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import LocalReynolds, Reynolds
-from modgnn_rl.envs.flocking.metrics import action_error, leader_lost
+from modgnn_rl.envs.flocking.metrics import leader_lost
+from modgnn_rl.envs.flocking.task import FlockingTask
+from modgnn_rl.evaluation.metrics import action_error
 from modgnn_rl.evaluation.rollout import make_eval_env
 from modgnn_rl.experiment.training import train
 from modgnn_rl.reporting.figure import GRID, INK, PAPER, draw, styles_of
@@ -101,15 +103,16 @@ def errors(
         errors, m^2/s^2, and shares of the time at which nobody heard the leader, in bins of `BIN` steps
         [flocks, bins].
     """
-    expert, size = Reynolds.for_env(env_config), env_config.sizes[0]
-    env = make_eval_env(policy, env_config, flocks, size, steps=steps, seed=1_000_000)
+    task, expert, size = FlockingTask(env_config), Reynolds.for_env(env_config), env_config.sizes[0]
+    env = make_eval_env(policy, task, flocks, size, steps=steps, seed=1_000_000)
     found, lost = [], []
     state = env.reset()
     with torch.no_grad(), set_recurrent_mode(False):
         for _ in range(steps):
             state = expert(policy(state))
             agents = state["agents"]
-            found.append(action_error(agents["action"], agents["expert_action"], agents["controlled"]))
+            difference = task.actions.difference(agents["action"], agents["expert_action"])
+            found.append(action_error(difference, agents["controlled"]))
             lost.append(leader_lost(agents["observation"][..., :3], env_config.comm_range).double())
             if flown_by_expert:
                 state[ACTION] = state[EXPERT_ACTION]

@@ -4,4 +4,4 @@ from .expert import Reynolds as Reynolds
 from .expert import reynolds as reynolds
 from .physics.engine import Physics as Physics
 from .physics.engine import TorchPhysics as TorchPhysics
-from .recording import FlockRecorder as FlockRecorder
+from .task import FlockingTask as FlockingTask

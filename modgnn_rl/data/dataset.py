@@ -23,7 +23,7 @@ from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 from torchrl.data.replay_buffers import Storage
 
-from modgnn_rl.configs.schema import FlockingConfig, as_list
+from modgnn_rl.configs.schema import FlockingConfig, TaskConfig, as_list
 from modgnn_rl.data.manifest import LOCK, MANIFEST, STATE, Manifest, check_shard
 from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
@@ -102,7 +102,7 @@ class EpisodeDataset:
             shards.append(TensorDict({"state": state.view(shape)}, shape[:2]))
         return cls(path, manifest, shards, device)
 
-    def check_env_config(self, env_config: FlockingConfig) -> None:
+    def check_env_config(self, env_config: TaskConfig) -> None:
         """Check that an env config is that of the episodes.
 
         Raises:

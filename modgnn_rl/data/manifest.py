@@ -23,7 +23,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.configs.schema import FlockingConfig, TaskConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils.files import write_atomically
@@ -215,12 +215,16 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def dataset_env_config(env_config: FlockingConfig, steps: int) -> FlockingConfig:
+def dataset_env_config(env_config: TaskConfig, steps: int) -> FlockingConfig:
     """The env config of a dataset of episodes with a number of steps.
 
     Raises:
         InputError: the state of this environment is more than positions and velocities.
     """
+    if not isinstance(env_config, FlockingConfig):
+        raise InputError(
+            f"env={env_config.name} has no datasets yet; train with trainer=dagger"
+        )
     if len(env_config.sizes) > 1:
         raise InputError(
             f"env.num_agents={env_config.sizes} names several sizes; a dataset has one: collect one for each"

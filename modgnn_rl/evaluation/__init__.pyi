@@ -1,7 +1,8 @@
+from .recording import Recorder as Recorder
+from .recording import record as record
 from .rollout import EpisodeMetrics as EpisodeMetrics
 from .rollout import evaluate as evaluate
 from .rollout import make_eval_env as make_eval_env
-from .rollout import reference_policies as reference_policies
 from .statistics import Interval as Interval
 from .statistics import Summary as Summary
 from .statistics import interquartile_interval as interquartile_interval

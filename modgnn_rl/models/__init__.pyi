@@ -1,4 +1,3 @@
-from .blocks import BallHead as BallHead
 from .blocks import LayerSpec as LayerSpec
 from .blocks import Relative as Relative
 from .blocks import Scale as Scale

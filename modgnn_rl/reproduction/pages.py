@@ -227,7 +227,7 @@ def _curves_by_hops(results: Results) -> list[Figure]:
     at = [
         (setting.num_agents if is_size else setting.changes["comm_range"], setting.name) for setting in study.settings
     ]
-    marks = {"trained": float(REFERENCE_SIZE) if is_size else results.config.env.comm_range}
+    marks = {"trained": float(REFERENCE_SIZE) if is_size else float(getattr(results.config.env, "comm_range", 0.0))}
     return [
         Figure(
             f"{results.config.study}_K{hops}",

@@ -12,17 +12,19 @@ from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs import TorchPhysics
 from modgnn_rl.envs.flocking.expert import Reynolds
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation.rollout import evaluate, reference_policies, rollout
+from modgnn_rl.evaluation.rollout import evaluate, rollout
 from modgnn_rl.evaluation.table import evaluation_markdown, read_tables, summarise_rollouts
 from modgnn_rl.registry import METRICS
 
+TASK = FlockingTask(FlockingConfig())
 ROLLOUT = {"num_agents": 6, "num_flocks": 4, "steps": 40, "seed": 3}
 
 
 @pytest.fixture(scope="module")
 def rollouts():
-    return evaluate({"gcn": make_model("gcn", seed=0)}, FlockingConfig(), **ROLLOUT)
+    return evaluate({"gcn": make_model("gcn", seed=0)}, TASK, **ROLLOUT)
 
 
 def test_reference_policies_have_the_errors_they_must_have(rollouts):
@@ -33,7 +35,7 @@ def test_reference_policies_have_the_errors_they_must_have(rollouts):
 
 
 def test_equal_seeds_give_equal_rollouts(rollouts):
-    again = rollout(make_model("gcn", seed=0), FlockingConfig(), **ROLLOUT)
+    again = rollout(make_model("gcn", seed=0), TASK, **ROLLOUT)
     assert torch.equal(again["error"], rollouts["gcn"]["error"])
     assert torch.equal(again["min_distance"], rollouts["gcn"]["min_distance"])
 
@@ -47,8 +49,8 @@ def test_all_policies_have_the_same_starts_and_leaders():
             seen.setdefault(self, []).append(tensordict["agents", "observation"].clone())
             return super().forward(tensordict)
 
-    for policy in reference_policies(FlockingConfig()).values():
-        rollout(Spy(policy), FlockingConfig(), **ROLLOUT)
+    for policy in TASK.reference_policies().values():
+        rollout(Spy(policy), TASK, **ROLLOUT)
     first, *others = seen.values()
     assert len(others) == 3
     for other in others:
@@ -59,7 +61,9 @@ def test_all_policies_have_the_same_starts_and_leaders():
 
 def test_a_policy_acts_the_same_in_both_physics():
     policy = make_model("pair_force", seed=0)
-    in_torch, in_bullet = (rollout(policy, FlockingConfig(physics=name), **ROLLOUT) for name in ("torch", "bullet"))
+    in_torch, in_bullet = (
+        rollout(policy, FlockingTask(FlockingConfig(physics=name)), **ROLLOUT) for name in ("torch", "bullet")
+    )
     for name in ("error", "leader_distance", "cohesion", "separation", "min_distance", "reward"):
         torch.testing.assert_close(in_bullet[name], in_torch[name], rtol=1e-3, atol=1e-4)
     assert torch.equal(in_bullet["leader_lost"], in_torch["leader_lost"])
@@ -69,13 +73,13 @@ def test_rollouts_close_their_physics(monkeypatch):
     """Each flock in PyBullet holds a client until its environment is closed."""
     closed = []
     monkeypatch.setattr(TorchPhysics, "close", lambda physics: closed.append(physics))
-    rollout(make_model("gcn", seed=0), FlockingConfig(), **ROLLOUT)
+    rollout(make_model("gcn", seed=0), TASK, **ROLLOUT)
     assert len(closed) == 1
 
 
 def test_metrics_are_of_the_true_state_with_noisy_sensors():
     quiet, noisy = (
-        rollout(Reynolds(action=("agents", "action"), observation=key), config, **ROLLOUT)
+        rollout(Reynolds(action=("agents", "action"), observation=key), FlockingTask(config), **ROLLOUT)
         for key, config in (
             (("agents", "observation"), FlockingConfig()),
             (("agents", "state"), FlockingConfig(position_noise=0.5)),
@@ -94,7 +98,9 @@ def test_a_diverging_flock_is_rolled_out_to_the_end_and_counted():
     away = TensorDictModule(
         lambda observation: 10 * observation[..., :3], [("agents", "observation")], [("agents", "action")]
     )
-    metrics = rollout(away, FlockingConfig(max_distance=5.0), num_agents=6, num_flocks=3, steps=400, seed=0)
+    metrics = rollout(
+        away, FlockingTask(FlockingConfig(max_distance=5.0)), num_agents=6, num_flocks=3, steps=400, seed=0
+    )
     assert metrics["diverged"].all()
     assert metrics["leader_lost"].all()
 
@@ -106,7 +112,7 @@ def test_the_smallest_flocks_have_a_table_too(agents):
 
 
 def test_table_gives_mean_median_spread_and_paired_difference(rollouts):
-    table = summarise_rollouts(rollouts, seed=0)
+    table = summarise_rollouts(rollouts, TASK, seed=0)
     row = table["gcn"]
     errors = rollouts["gcn"]["error"]
     assert row["error"]["mean"] == pytest.approx(float(errors.mean()))
@@ -141,7 +147,7 @@ def test_tables_are_read_back(rollouts, tmp_path):
     file = tmp_path / "evaluation.json"
     assert read_tables(file) == {}
     file.write_text(json.dumps(_tables(rollouts, 6)))
-    assert read_tables(file)["6"]["rows"]["gcn"] == summarise_rollouts(rollouts, seed=0)["gcn"]
+    assert read_tables(file)["6"]["rows"]["gcn"] == summarise_rollouts(rollouts, TASK, seed=0)["gcn"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}]", '{"six": {"rows": {}}}', '{"6": 1}', '{"6": {}}'])
@@ -153,4 +159,11 @@ def test_a_damaged_table_is_refused(text, tmp_path):
 
 
 def _tables(rollouts, agents):
-    return {str(agents): {"num_flocks": 4, "steps": 40, "rows": summarise_rollouts(rollouts, seed=0)}}
+    return {
+        str(agents): {
+            "num_flocks": 4,
+            "steps": 40,
+            "task": "flocking",
+            "rows": summarise_rollouts(rollouts, TASK, seed=0),
+        }
+    }

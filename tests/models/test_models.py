@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 from modgnn_rl import load_policy
+from modgnn_rl.actions import Ball
 from modgnn_rl.configs.schema import (
     DAggerConfig,
     EvaluationConfig,
@@ -23,9 +24,10 @@ from modgnn_rl.configs.schema import (
     ModelConfig,
     TrainConfig,
 )
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import train
-from modgnn_rl.models.blocks import BallHead, LayerSpec, Scale
+from modgnn_rl.models.blocks import LayerSpec, Scale
 from modgnn_rl.models.equivariant import PairForce, VectorSquash
 from modgnn_rl.models.factory import configured_model, make_model
 from modgnn_rl.nn.modgnn import ModGNN, ModGNNLayer
@@ -68,7 +70,7 @@ def random_rotation(seed: int, determinant: int) -> Tensor:
 @given(seed=seeds, scale=st.sampled_from([0.0, 1.0, 1e3]))
 @torch.no_grad()
 def test_actions_stay_in_the_ball(name: str, layers: int, seed: int, scale: float) -> None:
-    policy = build(name, layers=layers, max_speed=0.7, seed=seed).double()
+    policy = build(name, layers=layers, head=Ball(0.7, 3), seed=seed).double()
     observation, adjacency = rollout(seed)
     speed = act(policy, scale * observation, adjacency).norm(dim=-1)
     assert speed.isfinite().all()
@@ -96,7 +98,7 @@ def test_absolute_position_is_hidden(name: str, layers: int, seed: int) -> None:
 @given(seed=seeds, hops=st.integers(1, 3), layers=st.integers(1, 3), determinant=st.sampled_from([1, -1]))
 @torch.no_grad()
 def test_pair_force_turns_with_the_world(seed: int, hops: int, layers: int, determinant: int) -> None:
-    policy = make_model("pair_force", hops, seed=seed, max_speed=1e3, layers=layers).double()
+    policy = make_model("pair_force", hops, seed=seed, head=Ball(1e3, 3), layers=layers).double()
     observation, adjacency = rollout(seed)
     rotation = random_rotation(seed, determinant)
     turned = (observation.unflatten(-1, (2, 3)) @ rotation).flatten(-2)
@@ -151,7 +153,7 @@ def test_gradients_are_finite_where_lengths_vanish(name: str, layers: int, case:
 
 @models
 def test_gradients_reach_every_parameter(name: str, layers: int) -> None:
-    policy = build(name, layers=layers, seed=0, max_speed=100.0).double()
+    policy = build(name, layers=layers, seed=0, head=Ball(100.0, 3)).double()
     act(policy, *rollout(0, steps=6)).square().sum().backward()
     assert all(parameter.grad is not None and parameter.grad.any() for parameter in policy.parameters())
 
@@ -236,7 +238,7 @@ def test_an_installed_package_provides_models(clean_registry: None, monkeypatch:
 
 @torch.no_grad()
 def test_gcn_is_linear_inside_the_ball() -> None:
-    policy = make_model("gcn", hops=2, max_speed=1e6, seed=0).double()
+    policy = make_model("gcn", hops=2, head=Ball(1e6, 3), seed=0).double()
     observation, adjacency = rollout(0)
     rest = act(policy, 0 * observation, adjacency)
     once = act(policy, observation, adjacency) - rest
@@ -267,7 +269,7 @@ def test_renamed_keys_serve_every_model() -> None:
 @given(seed=seeds)
 @torch.no_grad()
 def test_central_reads_all_agents_now_and_no_graph(seed: int) -> None:
-    policy = build("central", agents=4, seed=seed, max_speed=100.0).double()
+    policy = build("central", agents=4, seed=seed, head=Ball(100.0, 3)).double()
     observation, adjacency = rollout(seed, agents=4)
     action = act(policy, observation, adjacency)
     torch.testing.assert_close(act(policy, observation, ~adjacency), action)
@@ -304,7 +306,7 @@ def test_central_serves_one_number_of_agents_and_says_so() -> None:
     with pytest.raises(InputError, match="one layer"):
         build("central", layers=2)
     with pytest.raises(InputError, match=r"works for one number of agents, but env.num_agents=\[8, 16\] has several"):
-        configured_model(ModelConfig(name="central"), FlockingConfig(num_agents=[8, 16]), seed=0)
+        configured_model(ModelConfig(name="central"), FlockingTask(FlockingConfig(num_agents=[8, 16])), seed=0)
 
 
 @pytest.mark.parametrize("layers", [0, 1.5, "2"])
@@ -356,7 +358,7 @@ def test_a_seed_leaves_the_accelerators_generators(monkeypatch: pytest.MonkeyPat
 @given(seed=seeds, radius=st.floats(0.1, 10.0))
 def test_the_head_projects_onto_the_ball(seed: int, radius: float) -> None:
     action = 3 * torch.randn(9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    projected = BallHead(radius)(action)
+    projected = Ball(radius, 3)(action)
     speed = action.norm(dim=-1)
     torch.testing.assert_close(projected.norm(dim=-1), speed.clamp(max=radius))
     torch.testing.assert_close(torch.linalg.cross(projected, action), torch.zeros_like(action))

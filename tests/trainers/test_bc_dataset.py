@@ -19,6 +19,7 @@ from modgnn_rl.configs.schema import (
 )
 from modgnn_rl.data.collect import collect_dataset
 from modgnn_rl.data.dataset import EpisodeDataset, EpisodeWindows
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
@@ -64,7 +65,7 @@ def test_validation_episodes_are_not_trained_on(tmp_path: Path, dataset: Path, m
 def test_a_learner_fits_a_dataset(dataset: Path) -> None:
     policy = make_model("modgnn_mlp", hops=2, seed=0)
     buffer = EpisodeDataset.open(dataset).buffer(policy.window, 64, generator=torch.Generator().manual_seed(0))
-    learner = ImitationLearner(policy, BCConfig(ema_decay=0.9), (60, 60), seed=0)
+    learner = ImitationLearner(policy, FlockingTask(FlockingConfig()), BCConfig(ema_decay=0.9), (60, 60), seed=0)
     before = learner.validate(buffer)
     learner.fit(buffer, 60)
     assert learner.validate(buffer) < 0.5 * before

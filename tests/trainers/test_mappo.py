@@ -14,6 +14,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import BCConfig, DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.experiment.training import train
@@ -45,19 +46,19 @@ def cloned(tmp_path_factory, small_config):
 
 
 def _scores(policy):
-    rollouts = rollout(policy, ENV, num_agents=4, num_flocks=3, steps=12, seed=5)
+    rollouts = rollout(policy, FlockingTask(ENV), num_agents=4, num_flocks=3, steps=12, seed=5)
     return torch.cat((rollouts["error"], rollouts["reward"], rollouts["cohesion"]))
 
 
 def test_training_starts_from_exactly_the_policy_of_init_from(cloned, tmp_path, mappo_config):
     config = resolve_model(mappo_config(tmp_path, init_from=str(cloned.path)))
-    policy, expected = initial_policy(config), _scores(load_policy(cloned.path))
+    policy, expected = initial_policy(config, FlockingTask(config.env)), _scores(load_policy(cloned.path))
     assert config.model == ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
     assert torch.equal(_scores(policy), expected)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert torch.equal(_scores(GaussianActor(policy)), expected)
     fresh = resolve_model(mappo_config(tmp_path, model=ModelConfig(name="modgnn_mlp", hops=2, hidden=8)))
-    assert not torch.equal(_scores(initial_policy(fresh)), expected)
+    assert not torch.equal(_scores(initial_policy(fresh, FlockingTask(fresh.env))), expected)
 
 
 def test_critic_warmup_leaves_the_policy_unchanged(cloned, tmp_path, mappo_config):

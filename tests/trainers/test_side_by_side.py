@@ -11,7 +11,7 @@ import torch
 from modgnn_rl import load_policy, make_model
 from modgnn_rl.configs.schema import BCConfig, EvaluationConfig, FlockingConfig, ModelConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
@@ -122,7 +122,7 @@ def test_each_policy_is_trained_with_its_own_settings(tmp_path, bc_config):
     train(bc_config(tmp_path, models=["gcn"], hops=[1, 2], cloning_updates=1), callbacks=[start], evaluate=False)
     for hops in (1, 2):
         fresh = member_configs(bc_config(tmp_path, models=["gcn"], hops=[1, 2]))[f"gcn-K{hops}"]
-        expected = trainer_module.make_learner(fresh, (1, 1)).ema_policy.state_dict()
+        expected = trainer_module.make_learner(fresh, FlockingTask(fresh.env), (1, 1)).ema_policy.state_dict()
         assert all(torch.equal(value, expected[key]) for key, value in start.policies[f"gcn-K{hops}"].items())
 
 
@@ -180,7 +180,7 @@ def test_dart_collects_as_much_data_as_plain_cloning(tmp_path, monkeypatch, sett
 
 def _collected(policies, **settings):
     trainer = BCConfig(**{"num_envs": 1, "batch_size": 8, "ema_decay": 0.8, **settings})
-    spec = RolloutSpec(training_env_factory(ENV), 6, 4, steps=12, seed=0)
+    spec = RolloutSpec(FlockingTask(ENV).training_env, 6, 4, steps=12, seed=0)
     data = make_buffer(spec, trainer, policies, Reynolds(), hold_steps=12)
     data.extend(data.collect(1.0))
     return trainer, data.buffer
@@ -199,12 +199,12 @@ def test_fitting_together_equals_fitting_each_alone_on_the_same_batches(models):
         return [make_model(name, hidden=8, seed=seed, **model) for seed, (name, model) in enumerate(models)]
 
     trainer, buffer = _collected(policies(), hide_velocity=0.0)
-    together = [ImitationLearner(policy, trainer, (12, 12), seed=0) for policy in policies()]
+    together = [ImitationLearner(policy, FlockingTask(ENV), trainer, (12, 12), seed=0) for policy in policies()]
     losses = fit_together(together, buffer, 12)
     final = validate_together(together, buffer)
     for number, policy in enumerate(policies()):
         _, buffer = _collected(policies())  # the same data and the same batches
-        alone = ImitationLearner(policy, trainer, (12, 12), seed=0)
+        alone = ImitationLearner(policy, FlockingTask(ENV), trainer, (12, 12), seed=0)
         assert fit_together([alone], buffer, 12)[0] == pytest.approx(losses[number], rel=1e-4)
         assert alone.validate(buffer) == pytest.approx(final[number], rel=1e-3)
         for kind in ("policy", "ema_policy"):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.envs.parallel import parallel_flocks
 from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
 from modgnn_rl.utils.internals import (
@@ -89,7 +89,7 @@ def test_a_running_transform_of_torch_func_is_seen() -> None:
 
 def test_what_a_collector_carries_is_the_next_observation_and_can_be_replaced() -> None:
     """Else: rollouts do not resume where they were in `modgnn_rl.trainers.collectors.local`."""
-    make_env = training_env_factory(FlockingConfig())
+    make_env = FlockingTask(FlockingConfig()).training_env
     policy = make_model("gcn", seed=0)
     collector = LocalCollector(RolloutSpec(make_env, 2, 3, steps=2, seed=0), [policy])
     rollouts = collector.collect()

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from modgnn_rl.configs.schema import FlockingConfig, ReplayConfig
-from modgnn_rl.envs.flocking.recording import FlockRecorder
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError
-from modgnn_rl.evaluation.recording import record
-from modgnn_rl.evaluation.rollout import reference_policies, rollout
+from modgnn_rl.evaluation.recording import Recorder, record
+from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.nn.topology import as_matrix
 from modgnn_rl.replay import check_request
 from modgnn_rl.visualization import html
@@ -33,15 +33,15 @@ PERTURBED = FlockingConfig(num_agents=7, message_loss=0.3, delay=1, range_spread
 
 def _record(env_config, agents=7, steps=30, stride=1, name="expert"):
     """A recording, and for each step the edges of the graph and the positions."""
-    recorder, seen = FlockRecorder(env_config, stride), []
+    recorder, seen = Recorder(FlockingTask(env_config), stride), []
 
     def watch(flocks):
         recorder(flocks)
         edges = as_matrix(flocks["adjacency"], agents)[0].nonzero()
         seen.append((edges.numpy(), flocks[env_config.state_key][0, :, :3].double().numpy()))
 
-    policy = reference_policies(env_config)[name]
-    rollout(policy, env_config, num_agents=agents, num_flocks=2, steps=steps, seed=5, watch=watch)
+    policy = FlockingTask(env_config).reference_policies()[name]
+    rollout(policy, FlockingTask(env_config), num_agents=agents, num_flocks=2, steps=steps, seed=5, watch=watch)
     return recorder.recording(), seen
 
 
@@ -139,8 +139,10 @@ def test_the_page_loads_nothing_and_escapes_names(tmp_path):
 @pytest.mark.slow
 def test_two_rollouts_of_32_agents_and_1000_steps_take_less_than_a_megabyte(tmp_path):
     env_config, names = FlockingConfig(), ("expert", "local expert (1 hop)")
-    policies = reference_policies(env_config)
-    rollouts = {name: record(policies[name], env_config, num_agents=32, steps=1000, seed=5) for name in names}
+    policies = FlockingTask(env_config).reference_policies()
+    rollouts = {
+        name: record(policies[name], FlockingTask(env_config), num_agents=32, steps=1000, seed=5) for name in names
+    }
     html.write_replay(tmp_path / "replay.html", rollouts, "two rollouts")
     assert (tmp_path / "replay.html").stat().st_size < 1_000_000
 

@@ -12,6 +12,7 @@ import torch
 
 from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError
 from modgnn_rl.evaluation.recording import record
 from modgnn_rl.visualization.recording import Recording, quantise, range_flips, shortest_edges
@@ -20,7 +21,7 @@ from modgnn_rl.visualization.video import VIDEO_STRIDE, as_gif, write_video
 
 def _record(env_config, steps=12):
     expert = Reynolds.for_env(env_config, action=("agents", "action"))
-    return record(expert, env_config, num_agents=5, steps=steps, seed=3, stride=VIDEO_STRIDE)
+    return record(expert, FlockingTask(env_config), num_agents=5, steps=steps, seed=3, stride=VIDEO_STRIDE)
 
 
 def _recording(position: Any, present: Any, edges: Any, frames: int) -> Recording:

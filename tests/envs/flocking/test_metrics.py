@@ -31,29 +31,6 @@ def all_distances(position: Tensor) -> dict[str, Tensor]:
     }
 
 
-def test_action_error_is_the_mean_over_components_and_controlled_agents() -> None:
-    action, expert = random_flocks(2, 5), random_flocks(2, 5, seed=1)
-    controlled = torch.tensor([[False, True, True, True, True], [True, False, True, False, False]])
-    error = metrics.action_error(action, expert, controlled)
-    for flock in range(2):
-        squares = [
-            float(action[flock, i, d] - expert[flock, i, d]) ** 2
-            for i in range(5)
-            if controlled[flock, i]
-            for d in range(3)
-        ]
-        assert float(error[flock]) == pytest.approx(sum(squares) / len(squares))
-
-
-def test_action_error_ignores_agents_it_does_not_count() -> None:
-    action = torch.zeros(3, 2, 3)
-    action[0, 0] = torch.tensor([NAN, INF, 1.0])
-    controlled = torch.tensor([[False, True], [True, True], [False, False]])
-    error = metrics.action_error(action, torch.full_like(action, 2.0), controlled)
-    assert error[:2].tolist() == [4.0, 4.0]
-    assert error[2].isnan()
-
-
 def test_closed_form_line() -> None:
     """Agents at 0, 1, 3 and 8 m on a line; agent 0 leads."""
     position = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [8, 0, 0]])

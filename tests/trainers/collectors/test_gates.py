@@ -12,7 +12,7 @@ from modgnn_rl import load_policy, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, ModelConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, Ensemble, SafetyGate, disagreement, ensemble_std
@@ -77,7 +77,7 @@ def test_a_gate_after_a_mixture_only_adds_flocks_in_which_the_expert_acts():
 
 def _buffer(policies, gate, **settings):
     config = DAggerConfig(stride=1, capacity=1000, batch_size=16, **settings)
-    spec = RolloutSpec(training_env_factory(FlockingConfig(max_steps=7)), FLOCKS, AGENTS, steps=10, seed=0)
+    spec = RolloutSpec(FlockingTask(FlockingConfig(max_steps=7)).training_env, FLOCKS, AGENTS, steps=10, seed=0)
     return make_buffer(spec, config, policies, Reynolds(), hold_steps=10, gate=gate)
 
 

@@ -21,7 +21,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, Ensemble
 from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
@@ -38,11 +38,11 @@ import os, sys
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import CollectorConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.trainers.collectors.local import RolloutSpec
 from modgnn_rl.trainers.collectors.remote import RemoteCollector
 if __name__ == "__main__":
-    spec = RolloutSpec(training_env_factory(FlockingConfig()), 2, 3, steps=2, seed=0)
+    spec = RolloutSpec(FlockingTask(FlockingConfig()).training_env, 2, 3, steps=2, seed=0)
     behaviour = (make_model("gcn", seed=0), Reynolds())
     collector = RemoteCollector(spec, behaviour, CollectorConfig(sys.argv[1], 2))
     collector.collect()
@@ -62,7 +62,7 @@ def behaviour(seed: int = SEED) -> list[TensorDictModuleBase]:
 def remote(
     name: str = "process", *, timeout: float = 60.0, modules: list[TensorDictModuleBase] | None = None, **env_config
 ) -> RemoteCollector:
-    spec = RolloutSpec(training_env_factory(FlockingConfig(**env_config)), sum(SHARES), AGENTS, STEPS, SEED)
+    spec = RolloutSpec(FlockingTask(FlockingConfig(**env_config)).training_env, sum(SHARES), AGENTS, STEPS, SEED)
     workers = CollectorConfig(name, workers=len(SHARES), timeout=timeout)
     return RemoteCollector(spec, modules or behaviour(), workers)
 
@@ -71,7 +71,7 @@ def local(index: int, **env_config) -> tuple[LocalCollector, list[TensorDictModu
     """A collector in this process that should collect the rollouts of a worker."""
     seed = derive_seed(SEED, "worker", index)
     modules = behaviour(seed)
-    spec = RolloutSpec(training_env_factory(FlockingConfig(**env_config)), SHARES[index], AGENTS, STEPS, seed)
+    spec = RolloutSpec(FlockingTask(FlockingConfig(**env_config)).training_env, SHARES[index], AGENTS, STEPS, seed)
     return LocalCollector(spec, modules), modules
 
 
@@ -145,7 +145,7 @@ def test_weights_of_all_members_are_in_the_state_of_an_ensemble() -> None:
 
 
 def test_too_many_workers_and_unpicklable_modules_are_refused() -> None:
-    spec = RolloutSpec(training_env_factory(FlockingConfig()), 2, 4, steps=1, seed=0)
+    spec = RolloutSpec(FlockingTask(FlockingConfig()).training_env, 2, 4, steps=1, seed=0)
     with pytest.raises(InputError, match=r"collector\.workers=3 cannot share 2 flocks"):
         RemoteCollector(spec, behaviour(), CollectorConfig("process", workers=3))
     with pytest.raises(InputError, match="cannot be sent to other processes"):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.trainers.collectors.local import RolloutSpec
 from modgnn_rl.trainers.collectors.rollout_buffer import make_buffer
 from modgnn_rl.trainers.collectors.windows import reservoir_indices
@@ -70,7 +70,7 @@ def test_indices_are_those_of_algorithm_r():
 def _buffer(replacement, capacity):
     settings = DAggerConfig(stride=1, capacity=capacity, batch_size=4, replacement=replacement)
     policy = make_model("pair_force", hidden=8, seed=0)
-    spec = RolloutSpec(training_env_factory(FlockingConfig()), num_envs=2, num_agents=3, steps=5, seed=0)
+    spec = RolloutSpec(FlockingTask(FlockingConfig()).training_env, num_envs=2, num_agents=3, steps=5, seed=0)
     return make_buffer(spec, settings, [policy], Reynolds(), hold_steps=5)
 
 

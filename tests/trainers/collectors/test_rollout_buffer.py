@@ -10,14 +10,14 @@ from torch import nn
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, TrainConfig
 from modgnn_rl.envs.flocking.expert import Reynolds, reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.trainers.collectors.local import RolloutSpec
 from modgnn_rl.trainers.collectors.rollout_buffer import make_buffer, make_buffers
 from modgnn_rl.trainers.collectors.windows import slice_windows
 
 
 def _buffer(policy, seed=0):
-    spec = RolloutSpec(training_env_factory(FlockingConfig()), num_envs=4, num_agents=5, steps=10, seed=seed)
+    spec = RolloutSpec(FlockingTask(FlockingConfig()).training_env, num_envs=4, num_agents=5, steps=10, seed=seed)
     settings = DAggerConfig(stride=2, capacity=1000, batch_size=16)
     return make_buffer(spec, settings, [policy], Reynolds(), hold_steps=10)
 
@@ -86,7 +86,7 @@ def test_learned_messages_are_not_stored_but_windows_are():
 
 def test_sizes_have_equally_many_agents_in_all():
     config = TrainConfig(env=FlockingConfig(num_agents=[4, 8, 32]), trainer=DAggerConfig(num_envs=6))
-    make_env = training_env_factory(config.env)
-    buffers = make_buffers(config, make_env, [make_model("gcn", seed=0)], Reynolds(), steps=2, hold_steps=2)
+    task = FlockingTask(config.env)
+    buffers = make_buffers(config, task, [make_model("gcn", seed=0)], steps=2, hold_steps=2)
     shapes = [buffer.collect(0.0)["adjacency"].shape for buffer in buffers.values()]
     assert shapes == [(16, 2, 4, 4), (8, 2, 8, 8), (2, 2, 32, 32)]

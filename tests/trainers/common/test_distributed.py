@@ -23,7 +23,7 @@ import torch.distributed as dist
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig, MAPPOConfig, ModelConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError, NotFinite
 from modgnn_rl.experiment.training import resume, train
 from modgnn_rl.tracking.checkpoint import load_checkpoint
@@ -117,7 +117,7 @@ def _assert_close(one, other):
 def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
     settings = DAggerConfig(batch_size=32, learning_rates=[1e-2, 1e-2, 1e-2])
     policy = make_model("modgnn_mlp", seed=0)
-    spec = RolloutSpec(training_env_factory(ENV), 8, 6, steps=20, seed=0)
+    spec = RolloutSpec(FlockingTask(ENV).training_env, 8, 6, steps=20, seed=0)
     data = make_buffer(spec, settings, [policy], Reynolds(), hold_steps=20)
     data.extend(data.collect(1.0))
     chance = torch.Generator().manual_seed(1)
@@ -125,7 +125,9 @@ def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
     receivers = [random_receivers(torch.rand(32, 6, generator=chance) < 0.5, 3, chance) for _ in batches]
 
     def learn():
-        learner = ImitationLearner(make_model("modgnn_mlp", seed=0).double(), settings, (2, 4), seed=0)
+        learner = ImitationLearner(
+            make_model("modgnn_mlp", seed=0).double(), FlockingTask(ENV), settings, (2, 4), seed=0
+        )
         parts = [slice(0, split), slice(split, None)]
         part = parts[distributed.rank()] if distributed.size() > 1 else slice(None)
         for batch, chosen in zip(batches, receivers, strict=True):
@@ -145,7 +147,7 @@ def test_steps_on_parts_of_a_batch_are_the_steps_on_the_whole(tmp_path, split):
 def test_updates_on_parts_of_the_rollouts_are_the_updates_on_the_whole(tmp_path):
     settings = MAPPOConfig(num_minibatches=1, epochs=3, agents_per_state=100, critic_hidden=8, learning_rate=1e-2)
     actor = GaussianActor(make_model("moment_force", seed=0), 0.3)
-    spec = RolloutSpec(training_env_factory(ENV), 4, 4, steps=10, seed=0)
+    spec = RolloutSpec(FlockingTask(ENV).training_env, 4, 4, steps=10, seed=0)
     collector = LocalCollector(spec, (actor, Reynolds()))
     rollouts = [_double(collector.collect().clone()) for _ in range(2)]
     chance = torch.Generator().manual_seed(1)
@@ -154,7 +156,7 @@ def test_updates_on_parts_of_the_rollouts_are_the_updates_on_the_whole(tmp_path)
         each["agents", "controlled"] = controlled & (torch.rand(controlled.shape, generator=chance) < 0.6)
 
     def update():
-        learner = PPOLearner(make_model("moment_force", seed=0), settings, ENV.state_key, seed=0)
+        learner = PPOLearner(make_model("moment_force", seed=0), FlockingTask(ENV), settings, seed=0)
         for module in (learner.actor, learner.averaged, learner.reference_policy, learner.critic, learner.loss):
             module.double()
         for number, each in enumerate(rollouts):
@@ -170,13 +172,15 @@ def test_updates_on_parts_of_the_rollouts_are_the_updates_on_the_whole(tmp_path)
 def test_a_nan_in_one_process_is_handled_by_all(tmp_path):
     settings = DAggerConfig(on_nonfinite="skip")
     policy = make_model("gcn", seed=0)
-    spec = RolloutSpec(training_env_factory(ENV), 4, 6, steps=20, seed=0)
+    spec = RolloutSpec(FlockingTask(ENV).training_env, 4, 6, steps=20, seed=0)
     data = make_buffer(spec, settings, [policy], Reynolds(), hold_steps=20)
     data.extend(data.collect(1.0))
     batch = data.buffer.sample()
 
     def learn(on_nonfinite):
-        learner = ImitationLearner(make_model("gcn", seed=0), DAggerConfig(on_nonfinite=on_nonfinite), (2, 4), seed=0)
+        learner = ImitationLearner(
+            make_model("gcn", seed=0), FlockingTask(ENV), DAggerConfig(on_nonfinite=on_nonfinite), (2, 4), seed=0
+        )
         before, own = _weights(learner)[0], batch.clone()
         if distributed.rank() == 1:
             own["agents", "expert_action"][3, 0, 2] = torch.nan

@@ -11,23 +11,26 @@ import torch
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.trainers.collectors.local import RolloutSpec
 from modgnn_rl.trainers.collectors.rollout_buffer import make_buffer
 from modgnn_rl.trainers.imitation.learner import ImitationLearner, cosine_learning_rate
 
+TASK = FlockingTask(FlockingConfig())
 RATES = (3e-3, 1e-3, 1e-4)
 
 
 @pytest.fixture(scope="module")
 def rollouts():
     settings = DAggerConfig(capacity=500, batch_size=64)
-    spec = RolloutSpec(training_env_factory(FlockingConfig()), 8, 6, steps=40, seed=0)
+    spec = RolloutSpec(TASK.training_env, 8, 6, steps=40, seed=0)
     return make_buffer(spec, settings, [make_model("gcn", seed=0)], Reynolds(), hold_steps=40)
 
 
 def _learner(**settings):
-    return ImitationLearner(make_model("pair_force", seed=0), DAggerConfig(batch_size=64, **settings), (20, 60), seed=0)
+    return ImitationLearner(
+        make_model("pair_force", seed=0), TASK, DAggerConfig(batch_size=64, **settings), (20, 60), seed=0
+    )
 
 
 def test_the_learning_rate_passes_its_three_values_without_jumps():
@@ -66,7 +69,7 @@ def test_the_seed_determines_the_weights():
     for _ in range(2):
         settings = DAggerConfig(capacity=500, batch_size=64)
         learner = _learner()
-        spec = RolloutSpec(training_env_factory(FlockingConfig()), 8, 6, steps=40, seed=0)
+        spec = RolloutSpec(TASK.training_env, 8, 6, steps=40, seed=0)
         data = make_buffer(spec, settings, [learner.ema_policy], Reynolds(), hold_steps=40)
         data.extend(data.collect(0.5))
         learner.fit(data.buffer, 5)

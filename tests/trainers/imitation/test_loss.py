@@ -11,7 +11,8 @@ from tensordict import TensorDict
 from modgnn_rl import ModGNN, ModGNNLayer, make_model
 from modgnn_rl.configs.schema import DAggerConfig, FlockingConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
+from modgnn_rl.layout import STATE
 from modgnn_rl.trainers.collectors.local import RolloutSpec
 from modgnn_rl.trainers.collectors.rollout_buffer import make_buffer
 from modgnn_rl.trainers.collectors.windows import slice_windows, uses_stored_messages, window_length
@@ -106,7 +107,7 @@ def test_every_controlled_agent_is_chosen_equally_often():
 
 
 def test_rotations_are_rotations_and_uniform():
-    rotations = random_rotations(5000, torch.zeros((), dtype=torch.float64), torch.Generator().manual_seed(0))
+    rotations = random_rotations(5000, STATE, torch.zeros((), dtype=torch.float64), torch.Generator().manual_seed(0))
     identity = torch.eye(3, dtype=torch.float64).expand_as(rotations)
     torch.testing.assert_close(rotations @ rotations.mT, identity)
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(5000, dtype=torch.float64))
@@ -116,7 +117,7 @@ def test_rotations_are_rotations_and_uniform():
 
 
 def test_rotate_applies_the_matrix_of_each_sample_to_its_vectors():
-    rotations = random_rotations(4, torch.zeros(()), torch.Generator().manual_seed(0))
+    rotations = random_rotations(4, STATE, torch.zeros(()), torch.Generator().manual_seed(0))
     data = torch.randn(4, 1, 5, 6, generator=torch.Generator().manual_seed(1))
     turned = rotate(data, rotations)
     for sample in range(4):
@@ -140,7 +141,7 @@ def test_training_on_stored_messages_equals_training_on_windows(name, model):
     """For rollouts with resets in the middle: messages as collected, and as recomputed in windows."""
     policy = make_model(name, hidden=8, seed=0, **model)
     settings = DAggerConfig(stride=3, capacity=1000, batch_size=16)
-    spec = RolloutSpec(training_env_factory(FlockingConfig(max_steps=6)), 4, 4, steps=13, seed=0)
+    spec = RolloutSpec(FlockingTask(FlockingConfig(max_steps=6)).training_env, 4, 4, steps=13, seed=0)
     data = make_buffer(spec, settings, [policy], Reynolds(), hold_steps=13)
     assert uses_stored_messages(policy)
     assert data.windows.window == 1
@@ -193,7 +194,7 @@ def test_stacked_losses_and_gradients_equal_those_of_a_loop(name, model, window)
 def test_velocities_of_a_window_are_hidden_all_or_none(share, seed):
     batch = _batch(3)
     before = batch.clone()
-    hide_velocities(batch, share, torch.Generator().manual_seed(seed))
+    hide_velocities(batch, STATE, share, torch.Generator().manual_seed(seed))
     observation, was = batch["agents", "observation"], before["agents", "observation"]
     assert torch.equal(observation[..., :3], was[..., :3])
     hidden = (observation[..., 3:] == 0).flatten(1)
@@ -207,7 +208,7 @@ def test_velocities_of_a_window_are_hidden_all_or_none(share, seed):
 
 def test_velocities_are_hidden_in_the_given_fraction_of_windows():
     batch = torch.cat([_batch(1) for _ in range(200)])
-    hide_velocities(batch, 0.3, torch.Generator().manual_seed(0))
+    hide_velocities(batch, STATE, 0.3, torch.Generator().manual_seed(0))
     hidden = (batch["agents", "observation"][..., 3:] == 0).flatten(1).all(1)
     assert hidden.double().mean().item() == pytest.approx(0.3, abs=0.05)
 

@@ -12,7 +12,8 @@ from modgnn_rl import load_policy
 from modgnn_rl.configs.schema import (
     FlockingConfig,
 )
-from modgnn_rl.evaluation.rollout import reference_policies, rollout
+from modgnn_rl.envs.flocking.task import FlockingTask
+from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.experiment import training
 from modgnn_rl.experiment.training import train
 from modgnn_rl.registry import METRICS
@@ -67,8 +68,8 @@ def watch(tmp_path, small_config):
     recorder = Recorder()
     config = small_config(tmp_path, "dagger", env=FlockingConfig(num_agents=[4, 5]), video_rounds=100)
     run = RunFolder.create(tmp_path, "dagger", "seed: 0\n")
-    policies = {"idle": reference_policies(config.env)["zero action"]}
-    watch = DashboardCallback(config, run, LoggerGroup({"recorder": lambda: recorder}))
+    policies = {"idle": FlockingTask(config.env).reference_policies()["zero action"]}
+    watch = DashboardCallback(config, FlockingTask(config.env), run, LoggerGroup({"recorder": lambda: recorder}))
     watch.on_start(policies)
     return watch, recorder
 
@@ -109,7 +110,7 @@ def test_reference_lines_are_those_of_the_reference_rollouts(watch):
     env_config = watch.config.env
     for size in (4, 5):
         columns, rows = recorder.tables[f"references/{size}"]
-        assert [row[0] for row in rows] == list(reference_policies(env_config))
+        assert [row[0] for row in rows] == list(FlockingTask(env_config).reference_policies())
         assert (
             dict(zip(columns, rows[-1], strict=True))["error"] == watch.references[f"{size}/error"]["zero action"] > 0
         )
@@ -122,8 +123,8 @@ def test_reference_lines_are_those_of_the_reference_rollouts(watch):
     )
     assert lines["4/error"]["expert"] == 0
     seed = dashboard_callback.derive_seed(watch.config.seed, "references", 5)
-    expert = reference_policies(env_config)["expert"]
-    rollouts = rollout(expert, env_config, num_agents=5, num_flocks=1, steps=6, seed=seed)
+    expert = FlockingTask(env_config).reference_policies()["expert"]
+    rollouts = rollout(expert, FlockingTask(env_config), num_agents=5, num_flocks=1, steps=6, seed=seed)
     assert lines["pair_force-K1/5/cohesion"]["expert"] == float(rollouts["cohesion"].mean())
 
 

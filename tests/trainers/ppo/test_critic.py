@@ -8,8 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from modgnn_rl.configs.schema import FlockingConfig
+from modgnn_rl.envs.flocking.features import flock_features
+from modgnn_rl.envs.flocking.task import FlockingTask
+from modgnn_rl.layout import STATE
 from modgnn_rl.trainers.imitation.loss import random_rotations, rotate
-from modgnn_rl.trainers.ppo.critic import FlockCritic, PooledCritic, flock_features
+from modgnn_rl.trainers.ppo.critic import CentralCritic, PooledCritic
 
 DOUBLE = torch.float64
 
@@ -23,7 +27,7 @@ def _states(flocks, agents, seed=0):
 def critic():
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return FlockCritic(hidden=16).double()
+        return CentralCritic(FlockingTask(FlockingConfig()).critic_input(), hidden=16).double()
 
 
 def _values(critic, state, mask=None):
@@ -51,8 +55,8 @@ def test_the_leader_cannot_be_swapped_with_a_follower(critic):
 def test_values_are_invariant_to_translation_rotation_and_reflection(critic, seed, agents, mirrored):
     generator = torch.Generator().manual_seed(seed)
     state = _states(3, agents, seed)
-    matrices = random_rotations(3, state, generator)
-    moved = rotate(state, -matrices if mirrored else matrices)
+    matrices = random_rotations(3, STATE, state, generator)
+    moved = rotate(state, -matrices if mirrored else matrices, 2)
     moved[..., :3] += 20 * torch.randn(3, 1, 3, generator=generator, dtype=DOUBLE)
     torch.testing.assert_close(_values(critic, moved), _values(critic, state), rtol=1e-6, atol=1e-8)
 
@@ -88,7 +92,7 @@ def test_agents_that_do_not_exist_do_not_affect_gradients(critic):
 
 @pytest.mark.parametrize("agents", [1, 2, 40])
 def test_any_number_of_agents_and_any_leading_dimensions(agents):
-    critic = FlockCritic(hidden=8)
+    critic = CentralCritic(FlockingTask(FlockingConfig()).critic_input(), hidden=8)
     state = _states(6, agents).float()
     values = _values(critic, state.view(2, 3, agents, 6))
     assert values.shape == (2, 3, agents, 1)

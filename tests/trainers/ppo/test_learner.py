@@ -12,7 +12,7 @@ from torchrl.modules import set_recurrent_mode
 from modgnn_rl import make_model
 from modgnn_rl.configs.schema import FlockingConfig, MAPPOConfig
 from modgnn_rl.envs.flocking.expert import Reynolds
-from modgnn_rl.envs.flocking.task import training_env_factory
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.trainers.collectors.local import LocalCollector, RolloutSpec
 from modgnn_rl.trainers.ppo.learner import RECEIVERS, PPOLearner
 
@@ -23,11 +23,11 @@ FLOCKS, AGENTS, STEPS = 4, 5, 10
 def _learner(name="pair_force", *, model=None, env_config=ENV, **settings):
     policy = make_model(name, hidden=8, seed=0, **(model or {}))
     small = {"window": 3, "epochs": 1, "num_minibatches": 2, "critic_hidden": 8}
-    return PPOLearner(policy, MAPPOConfig(**{**small, **settings}), env_config.state_key, seed=0)
+    return PPOLearner(policy, FlockingTask(env_config), MAPPOConfig(**{**small, **settings}), seed=0)
 
 
 def _collector(learner, *, env_config=ENV, steps=STEPS):
-    spec = RolloutSpec(training_env_factory(env_config), FLOCKS, AGENTS, steps, seed=0)
+    spec = RolloutSpec(FlockingTask(env_config).training_env, FLOCKS, AGENTS, steps, seed=0)
     return LocalCollector(spec, (learner.actor, Reynolds.for_env(env_config)))
 
 
