@@ -106,7 +106,7 @@ def groups_of(command: Command) -> dict[str, str]:
     """The choice that a command makes by default, by group."""
     return {
         group: choice for entry in _defaults(command.name) if isinstance(entry, dict) for group, choice in entry.items()
-    }
+    }  # a choice is None where the task decides
 
 
 def choices_of(command: Command, group: str) -> list[str]:

@@ -247,14 +247,15 @@ class Task:
     @functools.cached_property
     def metrics(self) -> list[str]:
         """Names of the registered metrics of this task: the error first, then its own, then those of all tasks."""
-        given = {"controlled", "reward"} | ({"difference"} if self.teacher is not None else set())
+        given = {"controlled", "reward", "action"} | ({"position"} if self.has_positions else set())
+        given |= {"expert_action", "difference"} if self.teacher is not None else set()
         given |= {"success"} if type(self).success is not Task.success else set()
         own, shared = [], []
         for name, entry in METRICS.items():
             task = entry.options.get("task")
             if task == self.name:
                 own.append(name)
-            elif task is None and given.issuperset(entry.options.get("inputs", ())):
+            elif task is None and given.issuperset(entry.options.get("inputs", ("position",))):
                 shared.append(name)
         return sorted([*own, *shared], key=lambda name: name != "error")
 

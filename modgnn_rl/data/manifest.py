@@ -222,9 +222,7 @@ def dataset_env_config(env_config: TaskConfig, steps: int) -> FlockingConfig:
         InputError: the state of this environment is more than positions and velocities.
     """
     if not isinstance(env_config, FlockingConfig):
-        raise InputError(
-            f"env={env_config.name} has no datasets yet; train with trainer=dagger"
-        )
+        raise InputError(f"env={env_config.name} has no datasets yet; train with trainer=dagger")
     if len(env_config.sizes) > 1:
         raise InputError(
             f"env.num_agents={env_config.sizes} names several sizes; a dataset has one: collect one for each"

@@ -50,8 +50,9 @@ def summarise_rollouts(rollouts: Mapping[str, EpisodeMetrics], task: Task, seed:
         row: dict[str, Any] = {metric: _summary(rollout, metric, rng) for metric in task.metrics}
         if "error" in task.metrics:
             row["error_by_quarter"] = rollout.error_by_quarter.nanmean(0).tolist()
-        if task.yardstick is not None and name != task.yardstick and row["error"] is not None:
-            own, local = (episodes["error"].cpu().numpy() for episodes in (rollout, rollouts[task.yardstick]))
+        yardstick = None if task.yardstick is None else rollouts.get(task.yardstick)
+        if yardstick is not None and name != task.yardstick and row["error"] is not None:
+            own, local = (episodes["error"].cpu().numpy() for episodes in (rollout, yardstick))
             row["error_minus_local"] = dataclasses.asdict(paired_difference(own, local, rng=rng))
         table[name] = row
     return table

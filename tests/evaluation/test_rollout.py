@@ -107,7 +107,7 @@ def test_a_diverging_flock_is_rolled_out_to_the_end_and_counted():
 
 @pytest.mark.parametrize("agents", [1, 2])
 def test_the_smallest_flocks_have_a_table_too(agents):
-    rollouts = evaluate({}, FlockingConfig(), num_agents=agents, num_flocks=3, steps=8, seed=0)
+    rollouts = evaluate({}, TASK, num_agents=agents, num_flocks=3, steps=8, seed=0)
     assert "| expert" in evaluation_markdown(_tables(rollouts, agents), "few")
 
 
@@ -128,7 +128,7 @@ def test_a_new_metric_appears_in_rollouts_and_tables(monkeypatch):
     METRICS.register(
         "height", title="height", unit="m", better="higher", about="mean height", over_time="mean", cell="{mean:.1f}"
     )(lambda position: position[..., 2])
-    rollouts = evaluate({}, FlockingConfig(), num_agents=3, num_flocks=2, steps=4, seed=0)
+    rollouts = evaluate({}, FlockingTask(FlockingConfig()), num_agents=3, num_flocks=2, steps=4, seed=0)
     assert rollouts["expert"]["height"].shape == (2,)
     table = _tables(rollouts, 3)
     assert table["3"]["rows"]["expert"]["height"]["mean"] == float(rollouts["expert"]["height"].mean())
@@ -164,6 +164,6 @@ def _tables(rollouts, agents):
             "num_flocks": 4,
             "steps": 40,
             "task": "flocking",
-            "rows": summarise_rollouts(rollouts, TASK, seed=0),
+            "rows": summarise_rollouts(rollouts, FlockingTask(FlockingConfig()), seed=0),
         }
     }

@@ -190,7 +190,7 @@ def test_an_invalid_setting_is_one_line_and_leaves_nothing(tmp_path, arguments, 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["env.num_agents=[4,4]"], "must list each size once"),
+        (["env.num_agents=[4,4]"], "must list each number once"),
         (["env.start_distance=9"], "do not fit into a ball"),
         (["model.hops=0"], "has nothing to learn"),
         (["device=tpu9"], "device=tpu9"),

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from modgnn_rl.configs.schema import BCConfig, DAggerConfig, MAPPOConfig, RunsConfig, TrainConfig
+from modgnn_rl.configs.schema import BCConfig, DAggerConfig, MAPPOConfig, ModelConfig, RunsConfig, TrainConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.registry import METRICS
 from modgnn_rl.runs import find_run, show_runs
@@ -33,7 +33,9 @@ ERRORS = [0.9, 0.8, 0.4, 0.3, 0.2, 0.1]
 def stored(trainer):
     """The configuration of a run, as YAML, made once."""
     if (key := repr(trainer)) not in YAML:
-        YAML[key] = OmegaConf.to_yaml(OmegaConf.structured(TrainConfig(trainer=trainer)))
+        YAML[key] = OmegaConf.to_yaml(
+            OmegaConf.structured(TrainConfig(model=ModelConfig(name="moment_force"), trainer=trainer))
+        )
     return YAML[key]
 
 

@@ -51,13 +51,14 @@ def _scores(policy):
 
 
 def test_training_starts_from_exactly_the_policy_of_init_from(cloned, tmp_path, mappo_config):
-    config = resolve_model(mappo_config(tmp_path, init_from=str(cloned.path)))
+    config = resolve_model(mappo_config(tmp_path, init_from=str(cloned.path)), FlockingTask(ENV))
     policy, expected = initial_policy(config, FlockingTask(config.env)), _scores(load_policy(cloned.path))
     assert config.model == ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
     assert torch.equal(_scores(policy), expected)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert torch.equal(_scores(GaussianActor(policy)), expected)
-    fresh = resolve_model(mappo_config(tmp_path, model=ModelConfig(name="modgnn_mlp", hops=2, hidden=8)))
+    model = ModelConfig(name="modgnn_mlp", hops=2, hidden=8)
+    fresh = resolve_model(mappo_config(tmp_path, model=model), FlockingTask(ENV))
     assert not torch.equal(_scores(initial_policy(fresh, FlockingTask(fresh.env))), expected)
 
 

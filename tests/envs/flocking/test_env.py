@@ -646,6 +646,7 @@ def test_specs_hold_on_a_gpu() -> None:
 def test_presets() -> None:
     """``env=paper`` differs from the default in the separation and the leader."""
     preset = yaml.safe_load((Path(configs.__file__).parent / "env" / "paper.yaml").read_text())
+    assert preset.pop("defaults") == ["flocking", "_self_"]
     paper, default = FlockingConfig(**preset), FlockingConfig()
     check(paper, "env")
     names = ("cohesion_gain", "separation_gain", "alignment_gain", "max_speed", "start_radius", "leader_noise")

@@ -20,6 +20,7 @@ from modgnn_rl.errors import InputError
 
 EXPERT = Reynolds(action=("agents", "action"))
 OUTDOORS = yaml.safe_load((Path(configs.__file__).parent / "env" / "outdoors.yaml").read_text())
+del OUTDOORS["defaults"]
 
 WORLDS: dict[str, dict[str, Any]] = {
     "plain": {},

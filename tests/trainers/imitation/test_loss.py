@@ -119,7 +119,7 @@ def test_rotations_are_rotations_and_uniform():
 def test_rotate_applies_the_matrix_of_each_sample_to_its_vectors():
     rotations = random_rotations(4, STATE, torch.zeros(()), torch.Generator().manual_seed(0))
     data = torch.randn(4, 1, 5, 6, generator=torch.Generator().manual_seed(1))
-    turned = rotate(data, rotations)
+    turned = rotate(data, rotations, 2)
     for sample in range(4):
         for part in (slice(0, 3), slice(3, 6)):
             expected = data[sample, ..., part] @ rotations[sample].T
