@@ -39,7 +39,7 @@ def setting(
     """Declare a dataclass field with its documentation and its legal values.
 
     Args:
-        default: default value; lists are copied for each instance.
+        default: default value; lists and dictionaries are copied for each instance.
         help: one line that says what the setting does, with its unit in brackets.
         ge: smallest legal value.
         gt: exclusive lower bound.
@@ -50,7 +50,7 @@ def setting(
     """
     metadata: dict[str, Any] = {"help": help, "ge": ge, "gt": gt, "le": le, "whole": whole, "length": length}
     metadata["choices"] = choices
-    if isinstance(default, list):
+    if isinstance(default, (list, dict)):
         return dataclasses.field(default_factory=lambda: copy.copy(default), metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
 

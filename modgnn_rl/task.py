@@ -78,6 +78,8 @@ class Task:
 
     Attributes:
         default_model: model that is trained unless ``model=`` names another.
+        bootstraps_at_termination: whether MAPPO estimates the value of a state in which an episode terminates like any
+            other. If each step is costly, agents would else gain from whatever ends an episode.
         min_agents: smallest number of agents.
         group: group of agents that the policy controls, of an environment with several; None: the only one.
         frequency: steps a second, for replays and exported agents, Hz.
@@ -87,6 +89,7 @@ class Task:
     """
 
     default_model = "modgnn_mlp"
+    bootstraps_at_termination = False
     min_agents = 1
     group: str | None = None
     frequency = 10.0
@@ -144,9 +147,9 @@ class Task:
         """Places that replays mark, such as goals [*B, M, D]; default: none."""
         return None
 
-    def success(self, data: TensorDictBase) -> Tensor | None:
-        """Whether the task is solved in the state after a step, bool [*B]; None: the task has no such state."""
-        return None
+    def success(self, data: TensorDictBase) -> Tensor:
+        """Whether the task is solved in a state, bool [*B]; not defined: the task has no such state."""
+        raise NotImplementedError(f"{type(self).__name__} has no success(data)")
 
     def quantities(self, data: TensorDictBase) -> dict[str, Tensor]:
         """Further inputs of the task's own metrics, by name, with leading dimensions [*B]."""
@@ -219,9 +222,19 @@ class Task:
         return changed
 
     @property
+    def can_rotate(self) -> bool:
+        """Whether imitation may rotate or reflect observations and actions, as `layout` says."""
+        return self.layout.is_rotatable and self.actions.is_symmetric(self.layout.symmetries, self.layout.dims)
+
+    @property
     def has_positions(self) -> bool:
         """Whether there are positions, so that replays can be drawn."""
         return bool(self.layout.vectors) or type(self).positions is not Task.positions
+
+    @property
+    def has_success(self) -> bool:
+        """Whether `success` is defined."""
+        return type(self).success is not Task.success
 
     @property
     def has_other_expert(self) -> bool:
@@ -249,7 +262,7 @@ class Task:
         """Names of the registered metrics of this task: the error first, then its own, then those of all tasks."""
         given = {"controlled", "reward", "action"} | ({"position"} if self.has_positions else set())
         given |= {"expert_action", "difference"} if self.teacher is not None else set()
-        given |= {"success"} if type(self).success is not Task.success else set()
+        given |= {"success"} if self.has_success else set()
         own, shared = [], []
         for name, entry in METRICS.items():
             task = entry.options.get("task")
@@ -276,9 +289,8 @@ class Task:
             found["reward"] = reward.squeeze(-1)
         if (position := self.positions(data)) is not None:
             found["position"] = position
-        after = data["next"] if ("next", "done") in data.keys(True) else data
-        if (success := self.success(after)) is not None:
-            found["success"] = success
+        if self.has_success:
+            found["success"] = self.success(data["next"] if ("next", "done") in data.keys(True) else data)
         return found | self.quantities(data)
 
     def frame(self, data: TensorDictBase) -> Frame:
