@@ -131,6 +131,11 @@ class FlockingConfig(TaskConfig):
     )
 
     @property
+    def reference_size(self) -> int:
+        """The number of agents that ``trainer.num_envs`` and ``trainer.agents_per_state`` refer to."""
+        return REFERENCE_SIZE
+
+    @property
     def hides_state(self) -> bool:
         """Whether observations differ from the true state, through delay or noise."""
         return self.delay > 0 or self.position_noise > 0 or self.velocity_noise > 0

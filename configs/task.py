@@ -25,3 +25,8 @@ class TaskConfig:
     def sizes(self) -> list[int]:
         """``num_agents`` as a list."""
         return as_list(self.num_agents)
+
+    @property
+    def reference_size(self) -> int:
+        """The number of agents that ``trainer.num_envs`` and ``trainer.agents_per_state`` refer to."""
+        return int(self.sizes[0])

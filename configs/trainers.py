@@ -20,12 +20,14 @@ class TrainerConfig:
     name: str = setting(MISSING, "trainer", choices=TRAINERS)
     num_envs: int = setting(
         32,
-        "flocks of 32 agents rolled out in parallel; the same number of agents is split evenly among flock sizes",
+        "environments rolled out in parallel, with the first of env.num_agents (flocking: with 32); the same number of "
+        "agents is split evenly among several numbers",
         ge=1,
     )
     agents_per_state: int = setting(
         4,
-        "agents per state of 32 that enter the loss; at size N 32 / N times as many, so that the edges are as many",
+        "agents of each state that enter the loss, with the first of env.num_agents (flocking: with 32); with N times "
+        "as many agents 1/N of it, so that the edges are as many",
         ge=1,
     )
     ema_decay: float = setting(
@@ -143,7 +145,8 @@ class MAPPOConfig(TrainerConfig):
     )
     agents_per_state: int = setting(
         8,
-        "agents per state of 32 that enter the loss; at size N 32 / N times as many, so that the edges are as many",
+        "agents of each state that enter the loss, with the first of env.num_agents (flocking: with 32); with N times "
+        "as many agents 1/N of it, so that the edges are as many",
         ge=1,
     )
     rounds: int = setting(100, "number of rounds", ge=1)

@@ -7,6 +7,7 @@ scores, of which the environment executes the highest; an expert's choice is a o
 from __future__ import annotations
 
 import abc
+from collections.abc import Collection
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +35,15 @@ class ActionSpace(nn.Module, abc.ABC):
     width: int
     idle_name = "zero action"
     is_equivariant = False
+
+    def is_symmetric(self, symmetries: Collection[str], dims: int) -> bool:
+        """Whether actions are vectors of space whose legal set does not change under some transformations.
+
+        Args:
+            symmetries: names of the transformations, see `modgnn_rl.layout.Layout`.
+            dims: dimension of space.
+        """
+        return False
 
     @abc.abstractmethod
     def forward(self, output: Tensor) -> Tensor:
@@ -66,6 +76,10 @@ class Ball(ActionSpace):
         super().__init__()
         self.radius, self.width = radius, width
 
+    def is_symmetric(self, symmetries: Collection[str], dims: int) -> bool:
+        """See `ActionSpace.is_symmetric`."""
+        return self.width == dims
+
     def forward(self, output: Tensor) -> Tensor:
         """Project onto the ball."""
         return clip_to_ball(output, self.radius)
@@ -87,6 +101,10 @@ class Box(ActionSpace):
         self.width = len(low)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
+
+    def is_symmetric(self, symmetries: Collection[str], dims: int) -> bool:
+        """See `ActionSpace.is_symmetric`; the corners of a box are not where they were after a rotation."""
+        return self.width == dims and "rotation" not in symmetries and bool((self.low == -self.high).all())
 
     def forward(self, output: Tensor) -> Tensor:
         """Squash each component into its bounds."""

@@ -17,7 +17,7 @@ from modgnn_rl.trainers.imitation.demonstrations import DART_PARTS, make_demonst
 from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
 from modgnn_rl.trainers.imitation.side_by_side import by_policy, member_configs, member_folders
 from modgnn_rl.trainers.loop.context import TrainContext
-from modgnn_rl.trainers.loop.setup import check_expert, check_steps, check_updates, make_learner
+from modgnn_rl.trainers.loop.setup import check_imitation, check_steps, check_updates, make_learner
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 from modgnn_rl.utils.seeds import derive_seed
 
@@ -32,7 +32,7 @@ MAX_ROLLOUT_STEPS = 250  # steps of these rollouts
 def check_bc(config: TrainConfig, policies: Sequence[ModGNN], task: Task) -> None:
     """Refuse too few updates, rollouts that are too short, and a dataset that is damaged or does not fit."""
     settings: BCConfig = config.trainer
-    check_expert(task, "bc")
+    check_imitation(config, task)
     check_updates(config, "cloning_updates")
     if settings.dataset is None:
         parts = DART_PARTS if settings.dart else 1

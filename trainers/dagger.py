@@ -19,7 +19,7 @@ from modgnn_rl.trainers.imitation.learner import fit_together, validate_together
 from modgnn_rl.trainers.loop.callbacks import StopOnPlateau
 from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.trainers.loop.metrics import mean_over_sizes, rollout_metrics
-from modgnn_rl.trainers.loop.setup import check_expert, check_steps, check_updates, make_learner
+from modgnn_rl.trainers.loop.setup import check_imitation, check_steps, check_updates, make_learner
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
 
 __all__ = ["dagger"]
@@ -36,7 +36,7 @@ def ensemble_configs(config: TrainConfig) -> dict[str, TrainConfig]:
 
 def check_dagger(config: TrainConfig, policies: Sequence[ModGNN], task: Task) -> None:
     """Refuse tasks without an expert, too few updates, and rollouts that are too short."""
-    check_expert(task, "dagger")
+    check_imitation(config, task)
     check_updates(config, "cloning_updates")
     check_updates(config, "updates_per_round")
     check_steps(config, "steps_per_round", window_length(policies, config.trainer))

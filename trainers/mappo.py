@@ -14,6 +14,7 @@ from modgnn_rl.trainers.loop.context import TrainContext
 from modgnn_rl.trainers.loop.metrics import mean_over_sizes, reward_metrics, rollout_metrics
 from modgnn_rl.trainers.loop.setup import check_steps, initial_policy
 from modgnn_rl.trainers.loop.training_loop import TrainingLoop
+from modgnn_rl.trainers.ppo.actor import GaussianActor
 from modgnn_rl.trainers.ppo.learner import PPOLearner, ppo_window
 
 __all__ = ["kl_coef_of_round", "mappo"]
@@ -47,7 +48,9 @@ def mappo(context: TrainContext) -> dict[str, ModGNN]:
     with TrainingLoop(context, {name: learner}, collectors, total=settings.rounds, unit="rounds") as loop:
         for index in loop.rounds(1, settings.rounds):
             kl_coef = 0.0 if config.init_from is None else kl_coef_of_round(settings, index)
-            metrics = {"noise": learner.actor.noise, "kl_coef": kl_coef, "learning_rate": settings.learning_rate}
+            metrics = {"kl_coef": kl_coef, "learning_rate": settings.learning_rate}
+            if isinstance(learner.actor, GaussianActor):
+                metrics["noise"] = learner.actor.noise
             for size, collector in collectors.items():
                 rollouts = loop.on_collect(collector.collect())
                 metrics |= rollout_metrics(rollouts, task) | reward_metrics(rollouts, task)

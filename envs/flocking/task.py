@@ -33,6 +33,7 @@ class FlockingTask(Task):
     config: FlockingConfig
     default_model = "moment_force"
     group_name = "agents"
+    bootstraps_at_termination = True
     min_agents = 2  # the leader is not trained
     leader = 0
     yardstick = "local expert (1 hop)"

@@ -18,6 +18,7 @@ from torch import Tensor
 from modgnn_rl.errors import InputError
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.nn.primer import RecurrentStatePrimer
+from modgnn_rl.task import ACTION, EXPERT_ACTION
 
 __all__ = ["ActionNoise", "BetaMixture", "Ensemble", "SafetyGate", "beta_schedule", "disagreement", "ensemble_std"]
 
@@ -56,8 +57,8 @@ class BetaMixture(TensorDictModuleBase):
         beta: probability that the expert acts; may be changed at any time, and applies from the next choice on.
         hold_steps: steps between two choices.
         generator: source of randomness.
-        action: key of the policy's action, overwritten [*B, N, 3].
-        expert_action: key of the expert's action [*B, N, 3].
+        action: key of the policy's action, overwritten [*B, N, A].
+        expert_action: key of the expert's action [*B, N, A].
         expert_acts: key that tells where the expert acts, bool [*B, 1].
     """
 
@@ -69,8 +70,8 @@ class BetaMixture(TensorDictModuleBase):
         hold_steps: int,
         generator: torch.Generator,
         *,
-        action: NestedKey = ("agents", "action"),
-        expert_action: NestedKey = ("agents", "expert_action"),
+        action: NestedKey = ACTION,
+        expert_action: NestedKey = EXPERT_ACTION,
         expert_acts: NestedKey = "expert_acts",
     ) -> None:
         super().__init__()
@@ -117,25 +118,31 @@ class BetaMixture(TensorDictModuleBase):
             chance = torch.rand(tensordict.batch_size, generator=self.generator, device=self.generator.device)
             self._expert_acts, self._steps = (chance < self.beta).unsqueeze(-1).to(action.device), 0
         self._steps += 1
-        chosen = torch.where(self._expert_acts.unsqueeze(-1), expert_action, action)
+        chosen = torch.where(_over(self._expert_acts, action), expert_action, action)
         return tensordict.set(self.out_keys[0], chosen).set(self.out_keys[1], self._expert_acts.clone())
 
 
+def _over(chosen: Tensor, action: Tensor) -> Tensor:
+    """A choice for each environment [*B, 1], shaped to broadcast with actions [*B, N] or [*B, N, A]."""
+    return chosen.view(*chosen.shape, *[1] * (action.ndim - chosen.ndim))
+
+
 def disagreement(tensordict: TensorDictBase) -> Tensor:
-    """Distance between policy and expert: root mean square of ``|a - a*|`` over the controlled agents, m/s [*B]."""
-    agents = tensordict["agents"]
-    difference = (agents["action"] - agents["expert_action"]).square().sum(-1)
-    return _root_mean(difference, agents["controlled"])
+    """Distance between policy and expert: root mean square of ``|a - a*|`` over the controlled agents [*B]."""
+    difference = (tensordict[ACTION] - tensordict[EXPERT_ACTION]).square().sum(-1)
+    return _root_mean(difference, tensordict.get(("agents", "controlled"), None))
 
 
 def ensemble_std(tensordict: TensorDictBase) -> Tensor:
-    """Standard deviation between the members of an `Ensemble`: root mean square over controlled agents, m/s [*B]."""
-    agents = tensordict["agents"]
-    return _root_mean(agents["ensemble_std"].square(), agents["controlled"])
+    """Standard deviation between the members of an `Ensemble`: root mean square over controlled agents [*B]."""
+    controlled = tensordict.get(("agents", "controlled"), None)
+    return _root_mean(tensordict["agents", "ensemble_std"].square(), controlled)
 
 
-def _root_mean(values: Tensor, counted: Tensor) -> Tensor:
-    """Square root of the mean of [*B, N] over the counted agents, bool [*B, N]; 0 if there are none."""
+def _root_mean(values: Tensor, counted: Tensor | None) -> Tensor:
+    """Square root of the mean of [*B, N] over the counted agents, bool [*B, N]; 0 if there are none; default: all."""
+    if counted is None:
+        return values.mean(-1).sqrt()
     return (torch.where(counted, values, 0.0).sum(-1) / counted.sum(-1).clamp(min=1)).sqrt()
 
 
@@ -148,8 +155,8 @@ class SafetyGate(TensorDictModuleBase):
     Args:
         measure: maps the data of a step to the error in each environment [*B].
         threshold: the expert acts above it.
-        action: key of the action to be executed, overwritten [*B, N, 3].
-        expert_action: key of the expert's action [*B, N, 3].
+        action: key of the action to be executed, overwritten [*B, N, A].
+        expert_action: key of the expert's action [*B, N, A].
         expert_acts: key that tells where the expert acts, bool [*B, 1]: due to the gate or a `BetaMixture` before it.
     """
 
@@ -158,8 +165,8 @@ class SafetyGate(TensorDictModuleBase):
         measure: Callable[[TensorDictBase], Tensor],
         threshold: float,
         *,
-        action: NestedKey = ("agents", "action"),
-        expert_action: NestedKey = ("agents", "expert_action"),
+        action: NestedKey = ACTION,
+        expert_action: NestedKey = EXPERT_ACTION,
         expert_acts: NestedKey = "expert_acts",
     ) -> None:
         super().__init__()
@@ -172,7 +179,7 @@ class SafetyGate(TensorDictModuleBase):
         action, expert_action = (tensordict[key] for key in self.in_keys)
         is_above = (self.measure(tensordict) > self.threshold).unsqueeze(-1)
         acts = tensordict.get(self.out_keys[1], None)
-        tensordict.set(self.out_keys[0], torch.where(is_above.unsqueeze(-1), expert_action, action))
+        tensordict.set(self.out_keys[0], torch.where(_over(is_above, action), expert_action, action))
         return tensordict.set(self.out_keys[1], is_above if acts is None else acts | is_above)
 
 
@@ -182,15 +189,15 @@ class ActionNoise(TensorDictModuleBase):
     ``a + N(0, scale^2)`` in each component, independent in each step; labels do not change.
 
     Args:
-        scale: standard deviation, m/s; may be changed at any time. DART uses the root of the policy's mean squared
-            error.
+        scale: standard deviation, in the unit of the action; may be changed at any time. DART uses the root of the
+            policy's mean squared error.
         generator: source of randomness.
-        action: key of the action to be executed, overwritten [*B, N, 3].
+        action: key of the action to be executed, overwritten [*B, N, A].
     """
 
     seed_role = "disturbance"
 
-    def __init__(self, scale: float, generator: torch.Generator, *, action: NestedKey = ("agents", "action")) -> None:
+    def __init__(self, scale: float, generator: torch.Generator, *, action: NestedKey = ACTION) -> None:
         super().__init__()
         self.scale, self.generator = scale, generator
         self.in_keys: list[Any] = [action]
@@ -221,7 +228,7 @@ class Ensemble(TensorDictModuleBase):
 
     Args:
         members: the policies; they read and write the same keys.
-        ensemble_std: key of the root mean square distance of the members' actions from their mean, m/s [*B, N].
+        ensemble_std: key of the root mean square distance of the members' actions from their mean [*B, N].
     """
 
     def __init__(self, members: Sequence[ModGNN], *, ensemble_std: NestedKey = ("agents", "ensemble_std")) -> None:

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, RoundRobinWriter
 
-from modgnn_rl.configs.schema import REFERENCE_SIZE, CollectorConfig, ImitationConfig, TrainConfig
+from modgnn_rl.configs.schema import CollectorConfig, ImitationConfig, TrainConfig
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.task import Task
 from modgnn_rl.trainers.collectors.behaviour import ActionNoise, BetaMixture, Ensemble, SafetyGate, ensemble_std
@@ -287,4 +287,4 @@ def training_spec(config: TrainConfig, task: Task, size: int, steps: int) -> Rol
 
 def num_envs_of_size(config: TrainConfig, size: int) -> int:
     """Environments with ``size`` agents each that run in parallel; all sizes have the same number of agents in all."""
-    return max(1, round(REFERENCE_SIZE * config.trainer.num_envs / len(config.env.sizes) / size))
+    return max(1, round(config.env.reference_size * config.trainer.num_envs / len(config.env.sizes) / size))

@@ -5,18 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainerConfig
+from modgnn_rl.configs.schema import TrainerConfig
 
 __all__ = ["random_receivers", "receivers_per_state"]
 
 
-def receivers_per_state(settings: TrainerConfig, num_agents: int) -> int:
+def receivers_per_state(settings: TrainerConfig, reference_size: int, num_agents: int) -> int:
     """How many agents of a flock count in an update.
 
-    ``settings.agents_per_state`` of 32 agents; of N agents 32 / N times as many, so that their edges are as many and an
-    update takes as long.
+    ``settings.agents_per_state`` of R agents, the reference size; of N agents R / N times as many, so that their edges
+    are as many and an update takes as long.
     """
-    return max(1, round(settings.agents_per_state * REFERENCE_SIZE / num_agents))
+    return max(1, round(settings.agents_per_state * reference_size / num_agents))
 
 
 def random_receivers(controlled: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -57,7 +57,7 @@ class ImitationLearner:
             self.optimizer, lambda step: cosine_learning_rate(step, settings.learning_rates, updates)
         )
         self.guarded_optimizer = GuardedOptimizer(policy, self.optimizer, settings)
-        self.rotates = settings.rotate and task.layout.is_rotatable and not is_equivariant(policy)
+        self.rotates = settings.rotate and task.can_rotate and not is_equivariant(policy)
         self.updates_done = 0
 
     @property
@@ -105,7 +105,8 @@ class ImitationLearner:
         if settings.hide_velocity:
             hide_velocities(batch, self.task.layout, settings.hide_velocity, generator)
         controlled = batch["agents", "controlled"][:, -1]
-        return random_receivers(controlled, receivers_per_state(settings, controlled.shape[-1]), generator)
+        count = receivers_per_state(settings, self.task.config.reference_size, controlled.shape[-1])
+        return random_receivers(controlled, count, generator)
 
     def step(self, loss: Tensor, batch: TensorDictBase, receivers: Tensor) -> None:
         """Take an optimiser step along the gradients of the weights.

@@ -10,7 +10,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from modgnn_rl.configs.schema import REFERENCE_SIZE, TrainConfig
+from modgnn_rl.configs.schema import TrainConfig
 from modgnn_rl.errors import one_line
 from modgnn_rl.evaluation.recording import record
 from modgnn_rl.evaluation.rollout import rollout
@@ -27,7 +27,7 @@ from modgnn_rl.visualization.video import VIDEO_STRIDE, check_video, write_video
 __all__ = ["DashboardCallback", "log_evaluation"]
 
 STEPS = 200  # of a reference rollout and of a video
-FLOCKS = 4  # of 32 agents; fewer if there are more agents
+FLOCKS = 4  # of the reference size; fewer if there are more agents
 CHART_ROUNDS = 10  # rounds between two points of a reference line
 MAX_ACTIONS = 30_000  # components in a histogram
 
@@ -131,7 +131,7 @@ class DashboardCallback(Callback):
             policy,
             self.task,
             num_agents=size,
-            num_flocks=max(1, FLOCKS * REFERENCE_SIZE // size),
+            num_flocks=max(1, FLOCKS * self.config.env.reference_size // size),
             steps=self._steps,
             seed=derive_seed(self.config.seed, "references", size),
             device=self.config.device,

@@ -34,7 +34,8 @@ def rollout_metrics(rollouts: TensorDictBase, task: Task) -> dict[str, float]:
     if "error" in task.metrics:
         if expert_acts is not None:
             counted = counted & ~expert_acts
-        action = rollouts.get(("agents", "loc"), rollouts[ACTION])
+        without_noise = rollouts.get(("agents", "loc"), rollouts.get(("agents", "logits"), None))
+        action = rollouts[ACTION] if without_noise is None else without_noise
         difference = task.actions.difference(action, rollouts[EXPERT_ACTION])
         error = compute_metrics(["error"], task.config, {"difference": difference, "controlled": counted})["error"]
         measured["error"] = float(error.nanmean())

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 
+from modgnn_rl.actions import Discrete
 from modgnn_rl.configs.schema import ModelConfig, TrainConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.models.factory import configured_model
 from modgnn_rl.nn.modgnn import ModGNN
 from modgnn_rl.registry import TRAINERS
 from modgnn_rl.task import Task
-from modgnn_rl.tracking.loading import load_policy, stored_model
+from modgnn_rl.tracking.loading import load_policy, load_task, stored_model
 from modgnn_rl.tracking.run_folder import RunFolder
 from modgnn_rl.trainers.collectors.remote import check_collector
 from modgnn_rl.trainers.collectors.rollout_buffer import num_envs_of_size
@@ -19,7 +20,7 @@ from modgnn_rl.trainers.imitation.learner import ImitationLearner
 from modgnn_rl.utils.seeds import derive_seed
 
 __all__ = [
-    "check_expert",
+    "check_imitation",
     "check_steps",
     "check_training",
     "check_updates",
@@ -100,6 +101,8 @@ def check_training(config: TrainConfig, task: Task) -> None:
             "several policies cannot all start from that of init_from, they would stay equal: leave it out, or train "
             "one policy"
         )
+    if config.init_from is not None:
+        _check_widths(load_task(RunFolder.open(config.init_from)), task, config.init_from)
     policies = [initial_policy(member, task) for member in members]
     for member, policy in zip(members, policies, strict=True):
         if not list(policy.parameters()):
@@ -113,12 +116,37 @@ def check_training(config: TrainConfig, task: Task) -> None:
             env.reset()
 
 
-def check_expert(task: Task, trainer: str) -> None:
-    """Refuse a trainer that imitates, for a task without an expert."""
+def _check_widths(old: Task, new: Task, folder: str) -> None:
+    """Refuse a policy whose task has other observations or actions."""
+    widths = [(task.layout.width, task.actions.width) for task in (old, new)]
+    if widths[0] != widths[1]:
+        raise InputError(
+            f"init_from={folder} is a policy for task '{old.name}', with {widths[0][0]} numbers in an observation and "
+            f"{widths[0][1]} in an action; task '{new.name}' has {widths[1][0]} and {widths[1][1]}: start from a run "
+            "with the same"
+        )
+
+
+def check_imitation(config: TrainConfig, task: Task) -> None:
+    """Refuse to imitate an expert that is not there, and settings that the task's observations or actions exclude."""
+    settings, trainer = config.trainer, config.trainer.name
     if task.teacher is None:
         raise InputError(
             f"trainer={trainer} imitates an expert, which task '{task.name}' does not have; use trainer=mappo"
         )
+    if settings.hide_velocity and task.layout.vectors < 2:
+        raise InputError(
+            f"trainer.hide_velocity={settings.hide_velocity} needs observations with a velocity, and those of task "
+            f"'{task.name}' have none: set it to 0"
+        )
+    if isinstance(task.actions, Discrete):
+        distances = {"noise": 0.0, "dart": False, "gate": "none"}  # settings that compare or change actions as vectors
+        for name, off in distances.items():
+            if getattr(settings, name, off) != off:
+                raise InputError(
+                    f"trainer.{name}={getattr(settings, name)} is for continuous actions, and those of task "
+                    f"'{task.name}' are discrete: use trainer.{name}={str(off).lower()}"
+                )
 
 
 def check_updates(config: TrainConfig, name: str) -> None:

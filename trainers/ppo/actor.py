@@ -1,4 +1,4 @@
-"""A policy with exploration noise: its action is the mean of a normal distribution."""
+"""Policies that explore: actions sampled from a normal distribution, or from a categorical one."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from tensordict.nn import (
     TensorDictModuleBase,
 )
 from tensordict.utils import NestedKey
-from torch import nn
-from torchrl.modules import IndependentNormal
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, OneHotCategorical
 
-__all__ = ["GaussianActor"]
+from modgnn_rl.actions import ActionSpace, Discrete
+
+__all__ = ["CategoricalActor", "GaussianActor", "make_actor"]
 
 
 class GaussianActor(ProbabilisticTensorDictSequential):
@@ -66,26 +68,86 @@ class GaussianActor(ProbabilisticTensorDictSequential):
         return float(self.module[0].log_scale.detach().exp())
 
 
-class _Mean(TensorDictModuleBase):
-    """Writes the policy's action as the mean of a distribution, and sigma beside it."""
+class _Output(TensorDictModuleBase):
+    """Writes a policy's action under another key."""
 
-    def __init__(
-        self, policy: TensorDictModuleBase, noise: float, loc: NestedKey, scale: NestedKey, receivers: NestedKey
-    ) -> None:
+    def __init__(self, policy: TensorDictModuleBase, output: NestedKey, receivers: NestedKey) -> None:
         super().__init__()
-        self.policy = policy
-        self.log_scale = nn.Parameter(torch.tensor(math.log(noise)))
-        self.receivers = receivers
+        self.policy, self.receivers = policy, receivers
         self.in_keys: list[Any] = list(policy.in_keys)
-        self.out_keys: list[Any] = [loc, scale, *policy.out_keys[1:]]
+        self.out_keys: list[Any] = [output, *policy.out_keys[1:]]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         receivers = tensordict.get(self.receivers, None)
         options = {} if receivers is None else {"receivers": receivers}
         result = self.policy(tensordict.copy(), **options)
-        loc = result[self.policy.out_keys[0]]
-        tensordict.set(self.out_keys[0], loc)
-        tensordict.set(self.out_keys[1], self.log_scale.exp().expand_as(loc))
-        for key in self.out_keys[2:]:
+        tensordict.set(self.out_keys[0], result[self.policy.out_keys[0]])
+        for key in self.policy.out_keys[1:]:
             tensordict.set(key, result[key])
         return tensordict
+
+
+class _Mean(_Output):
+    """Writes the policy's action as the mean of a distribution, and sigma beside it."""
+
+    def __init__(
+        self, policy: TensorDictModuleBase, noise: float, loc: NestedKey, scale: NestedKey, receivers: NestedKey
+    ) -> None:
+        super().__init__(policy, loc, receivers)
+        self.log_scale = nn.Parameter(torch.tensor(math.log(noise)))
+        self.out_keys = [loc, scale, *policy.out_keys[1:]]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = super().forward(tensordict)
+        return tensordict.set(self.out_keys[1], self.log_scale.exp().expand_as(tensordict[self.out_keys[0]]))
+
+
+class CategoricalActor(ProbabilisticTensorDictSequential):
+    """Samples one of several actions, with the policy's output as the logits of their probabilities.
+
+    The sample is one-hot. With ``set_exploration_type(DETERMINISTIC)`` it acts like the policy.
+
+    Args:
+        policy: writes scores under its first out-key; not copied.
+        logits, log_prob: keys of the scores [*B, N, A] and of the log-probability of the action [*B, N].
+        receivers: see `GaussianActor`.
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        *,
+        logits: NestedKey = ("agents", "logits"),
+        log_prob: NestedKey = ("agents", "action_log_prob"),
+        receivers: NestedKey = ("agents", "receivers"),
+    ) -> None:
+        sample = ProbabilisticTensorDictModule(
+            in_keys={"logits": logits},
+            out_keys=[policy.out_keys[0]],
+            distribution_class=_OneHot,
+            return_log_prob=True,
+            log_prob_key=log_prob,
+            default_interaction_type=InteractionType.RANDOM,
+        )
+        super().__init__(_Output(policy, logits, receivers), sample)
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """The policy whose output are the logits."""
+        return self.module[0].policy
+
+
+class _OneHot(OneHotCategorical):
+    """TorchRL's distribution with samples of the type of the logits, as policies write them."""
+
+    def sample(self, *arguments: Any, **options: Any) -> Tensor:
+        return super().sample(*arguments, **options).to(self.logits.dtype)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        return super().deterministic_sample.to(self.logits.dtype)
+
+
+def make_actor(policy: TensorDictModuleBase, actions: ActionSpace, noise: float) -> GaussianActor | CategoricalActor:
+    """The actor for a kind of actions; ``noise`` is the initial standard deviation of continuous ones."""
+    return CategoricalActor(policy) if isinstance(actions, Discrete) else GaussianActor(policy, noise)

@@ -21,7 +21,7 @@ from modgnn_rl.trainers.common import distributed
 from modgnn_rl.trainers.common.optimization import GuardedOptimizer
 from modgnn_rl.trainers.common.sampling import random_receivers, receivers_per_state
 from modgnn_rl.trainers.common.state import TensorGroups, optimizer_state, restore_optimizer
-from modgnn_rl.trainers.ppo.actor import GaussianActor
+from modgnn_rl.trainers.ppo.actor import CategoricalActor, GaussianActor, make_actor
 from modgnn_rl.trainers.ppo.critic import CentralCritic
 from modgnn_rl.trainers.ppo.loss import MASK, REFERENCE_ACTION, KLPenaltyMAPPOLoss, SharedValueNorm
 from modgnn_rl.utils.seeds import derive_seed, seeded
@@ -57,13 +57,13 @@ class PPOLearner:
     """
 
     def __init__(self, policy: ModGNN, task: Task, settings: MAPPOConfig, seed: int) -> None:
-        self.settings, self.policy = settings, policy
+        self.settings, self.policy, self.task = settings, policy, task
         self.reference_policy = copy.deepcopy(policy).requires_grad_(False)
         self.averaged = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.ema_decay))
         self.device = device = next(policy.parameters()).device
         self.generator = torch.Generator().manual_seed(derive_seed(seed, "receivers"))
         self.order = torch.Generator(device).manual_seed(derive_seed(seed, "order"))
-        self.actor = GaussianActor(policy, settings.noise).to(device)
+        self.actor = make_actor(policy, task.actions, settings.noise).to(device)
         with seeded(derive_seed(seed, "critic")):
             self.critic = CentralCritic(task.critic_input(), hidden=settings.critic_hidden).to(device)
         self.loss = make_loss(self.actor, self.critic, settings)
@@ -93,12 +93,12 @@ class PPOLearner:
         """Write advantages, value targets and actions of the reference policy into rollouts [B, T].
 
         Rewards are scaled by ``1 - gamma``, so that values are those of an average step. Values are bootstrapped at the
-        end of an episode, terminated or truncated: otherwise a flock for which every step is costly would gain from a
-        collision.
+        end of a truncated episode, and if the task says so, of a terminated one.
         """
         data = rollouts.copy()
         data["next", "agents", "reward"] = (1 - self.settings.gamma) * rollouts["next", "agents", "reward"]
-        data["next", "terminated"] = torch.zeros_like(data["next", "terminated"])
+        if self.task.bootstraps_at_termination:
+            data["next", "terminated"] = torch.zeros_like(data["next", "terminated"])
         self.loss.value_estimator(data)
         controlled = rollouts["agents", "controlled"].unsqueeze(-1)
         advantage = data["agents", "advantage"]
@@ -108,7 +108,7 @@ class PPOLearner:
         if self.loss.kl_coef > 0:
             observed = rollouts.select(*self.reference_policy.in_keys, strict=False)
             with set_recurrent_mode(True):
-                rollouts[REFERENCE_ACTION] = self.reference_policy(observed)["agents", "action"]
+                rollouts[REFERENCE_ACTION] = self.reference_policy(observed)[self.policy.out_keys[0]]
 
     def update(self, rollouts: TensorDictBase, *, kl_coef: float = 0.0, critic_only: bool = False) -> dict[str, float]:
         """Take optimiser steps on rollouts of the actor; the first ``burn_in`` steps of a window do not count.
@@ -146,7 +146,7 @@ class PPOLearner:
     def _step(self, batch: TensorDictBase, critic_only: bool) -> dict[str, Tensor]:
         """Take one optimiser step on windows [S, W]; returns losses and diagnostics, [] each."""
         controlled = batch["agents", "controlled"]
-        count = receivers_per_state(self.settings, controlled.shape[-1])
+        count = receivers_per_state(self.settings, self.task.config.reference_size, controlled.shape[-1])
         chosen = random_receivers(controlled.flatten(0, 1), count, self.generator).view_as(controlled)
         chosen[:, : self.burn_in] = False
         batch = batch.copy()
@@ -193,7 +193,9 @@ class PPOLearner:
         self.updates_done = int(values["updates"])
 
 
-def make_loss(actor: GaussianActor, critic: CentralCritic, settings: MAPPOConfig) -> KLPenaltyMAPPOLoss:
+def make_loss(
+    actor: GaussianActor | CategoricalActor, critic: CentralCritic, settings: MAPPOConfig
+) -> KLPenaltyMAPPOLoss:
     """The loss, with the keys of `modgnn_rl.task_env.TaskEnv` and an estimator of advantages (multi-agent GAE)."""
     loss = KLPenaltyMAPPOLoss(
         actor,

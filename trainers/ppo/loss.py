@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.distributions import Categorical, kl_divergence
 from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import MAPPOLoss
 
@@ -22,7 +23,7 @@ class KLPenaltyMAPPOLoss(MAPPOLoss):
     """TorchRL's `MAPPOLoss` with a penalty for the divergence from a reference policy.
 
     Where the data have the reference policy's actions ``a_ref``, the result also has ``loss_kl``: `kl_coef` times
-    the Kullback-Leibler divergence ``|mu - a_ref|^2 / (2 sigma^2)`` of two normal distributions of equal sigma.
+    the Kullback-Leibler divergence, ``|mu - a_ref|^2 / (2 sigma^2)`` of two normal distributions of equal sigma.
 
     Args:
         arguments, options: see `torchrl.objectives.multiagent.MAPPOLoss`. The last but one module of the actor's
@@ -48,7 +49,7 @@ class KLPenaltyMAPPOLoss(MAPPOLoss):
         mask = tensordict.get(MASK, None)
         reference = tensordict.get(self.reference_action_key, None)
         if reference is not None:
-            divergence = ((dist.mean - reference) / dist.stddev).square().sum(-1, keepdim=True) / 2
+            divergence = divergence_from(dist, reference).unsqueeze(-1)
             losses.set("loss_kl", self.kl_coef * masked_mean(divergence, mask))
         with torch.no_grad():
             action, before = (tensordict[key] for key in (self.tensor_keys.action, self.tensor_keys.sample_log_prob))
@@ -58,6 +59,18 @@ class KLPenaltyMAPPOLoss(MAPPOLoss):
             losses.set("kl_approx", masked_mean(log_ratio.exp() - 1 - log_ratio, mask))
             losses.set("clip_fraction", masked_mean(clipped, mask))
         return losses
+
+
+def divergence_from(dist: Any, reference: Tensor) -> Tensor:
+    """Kullback-Leibler divergence from a reference policy, [*B, N].
+
+    Args:
+        dist: distribution of the actions: normal, or categorical, which has logits.
+        reference: actions of the reference policy [*B, N, A]: mean of a normal distribution of equal sigma, or logits.
+    """
+    if hasattr(dist, "logits"):
+        return kl_divergence(Categorical(logits=dist.logits), Categorical(logits=reference))
+    return ((dist.mean - reference) / dist.stddev).square().sum(-1) / 2
 
 
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
