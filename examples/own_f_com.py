@@ -1,9 +1,9 @@
-"""Write an f_com of one's own, and see what it learns from the expert.
+"""Write your own f_com, and see what it learns from the expert.
 
     python examples/own_f_com.py
 
 The f_com below is the expert's rule for one neighbour, with its three gains left open. They are fitted to the expert's
-forces on rollouts of the expert, then the policy flies by itself. Agents that hear everybody find the expert's own
+forces on rollouts of the expert, then the policy acts by itself. Agents that hear everybody find the expert's own
 gains, 0.06, 0.8 and 0.02. Agents that hear only their neighbours find gains that make up for those whom they do not
 hear.
 """
@@ -62,7 +62,7 @@ def error(policy: ModGNN, rollouts: TensorDictBase, f_final: nn.Module | None = 
         action = policy(rollouts.select(*policy.in_keys, strict=False))["agents", "action"]
     forces = rollouts["agents", "force"]
     difference = action - (forces if f_final is None else f_final(forces))
-    # Agent 0 is the leader, whom nobody flies; at the first step nobody has heard anybody yet.
+    # Agent 0 is the leader, which the policy does not control; at the first step there are no messages yet.
     return difference[:, 1:, 1:].square().mean()
 
 
@@ -82,7 +82,7 @@ def fit(policy: ModGNN, rollouts: TensorDictBase) -> None:
 def main(
     comm_ranges: Sequence[float] = (2.0, 3.5, 100.0), num_envs: int = 8, num_agents: int = 16, steps: int = 96
 ) -> dict[float, tuple[list[float], float]]:
-    """Fit and fly a policy for each range of hearing, m.
+    """Fit and roll out a policy for each communication range, m.
 
     Returns:
         gains, and error of the policy's actions on its own rollouts, m²/s², for each range.

@@ -1,10 +1,10 @@
-"""Compose a policy with an f_pre of one's own, and train it in a plain TorchRL loop.
+"""Compose a policy with your own f_pre, and train it in a plain TorchRL loop.
 
     python examples/own_f_pre.py
 
 The flock has two roles: every third agent is a scout, which keeps farther from the others than the rest do. A robot
 knows its own role, and f_pre reads it, under ``("own", "role")``, when it judges what comes in from a neighbour. The
-policy flies, the expert labels the states that it visits, and one optimiser goes on over all of them (DAgger).
+policy acts, the expert labels the states that it visits, and one optimiser fits all of them (DAgger).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def roles(observation: Tensor) -> Tensor:
 
 
 def error(policy: ModGNN, batch: TensorDictBase) -> Tensor:
-    """Mean squared error of the actions of the agents that the policy flies, m²/s²."""
+    """Mean squared error of the actions of the agents that the policy controls, m²/s²."""
     action = policy(batch.select(*policy.in_keys, strict=False))["agents", "action"]
     return (action - batch["agents", "expert_action"])[batch["agents", "controlled"]].square().mean()
 
@@ -120,9 +120,9 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--num-envs", type=int, default=16, help="flocks flown at once")
+    parser.add_argument("--num-envs", type=int, default=16, help="flocks rolled out in parallel")
     parser.add_argument("--num-agents", type=int, default=12, help="agents in each, the leader included")
-    parser.add_argument("--steps", type=int, default=48, help="steps flown in each round")
+    parser.add_argument("--steps", type=int, default=48, help="steps of each round")
     parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--updates", type=int, default=50, help="gradient steps in each round")
     parser.add_argument("--seed", type=int, default=0)

@@ -320,7 +320,7 @@ class Task:
             return probe(self, env)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is sent to other processes: the settings and the expert; the rest is made anew there."""
+        """What is sent to other processes: the settings and the expert; the rest is computed again there."""
         return {"config": self.config, "_expert": self._expert}
 
 

@@ -54,7 +54,7 @@ def test_modgnn_learns_on_vmas():
     assert sum(returns[-2:]) / 2 > 0.3  # without communication it is about 0.1
 
 
-def test_the_loss_of_the_vmas_example_sees_the_messages_that_were_flown():
+def test_the_loss_of_the_vmas_example_sees_the_messages_of_the_rollout():
     pytest.importorskip("vmas")
     module = example("modgnn_on_vmas")
     torch.manual_seed(0)
@@ -131,4 +131,4 @@ def test_own_callback_stops_early_and_learns_from_an_expert_that_keeps_more_dist
     assert figures["8"]["rows"]["expert"]["error"]["mean"] == 0
     printed = capsys.readouterr().out
     assert "round 2: error" in printed
-    assert "round 3: error" not in printed  # the first round that the policy flies alone is the second
+    assert "round 3: error" not in printed  # the first round in which the policy acts alone is the second

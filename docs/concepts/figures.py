@@ -95,7 +95,7 @@ def delayed_messages(figure: Figure) -> None:
 
 
 def errors(
-    policy: TensorDictModuleBase, env_config: FlockingConfig, *, flocks: int, steps: int, flown_by_expert: bool = False
+    policy: TensorDictModuleBase, env_config: FlockingConfig, *, flocks: int, steps: int, expert_acts: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """The error of a policy's actions over time, on rollouts of its own or of the expert, from the same fresh starts.
 
@@ -114,7 +114,7 @@ def errors(
             difference = task.actions.difference(agents["action"], agents["expert_action"])
             found.append(action_error(difference, agents["controlled"]))
             lost.append(leader_lost(agents["observation"][..., :3], env_config.comm_range).double())
-            if flown_by_expert:
+            if expert_acts:
                 state[ACTION] = state[EXPERT_ACTION]
             state = env.step_mdp(env.step(state))
     env.close()
@@ -127,8 +127,8 @@ def curves(values: Mapping[str, np.ndarray], env_config: FlockingConfig) -> dict
     rng = np.random.default_rng(0)
     length = BIN / env_config.control_frequency
     return {
-        name: Curve.over_seeds((np.arange(flown.shape[1]) + 0.5) * length, flown, rng=rng)
-        for name, flown in values.items()
+        name: Curve.over_seeds((np.arange(measured.shape[1]) + 0.5) * length, measured, rng=rng)
+        for name, measured in values.items()
     }
 
 
@@ -157,9 +157,9 @@ def compounding_errors(cloned: Path | None = None, dagger: Path | None = None) -
     }
     titles = {"on the expert's rollouts": True, "on rollouts of its own": False}
     panels = {}
-    for title, flown_by_expert in titles.items():
+    for title, expert_acts in titles.items():
         found = {
-            name: errors(policy, env_config, flocks=40, steps=1000, flown_by_expert=flown_by_expert)[0]
+            name: errors(policy, env_config, flocks=40, steps=1000, expert_acts=expert_acts)[0]
             for name, policy in policies.items()
         }
         for name, values in found.items():
@@ -187,11 +187,11 @@ def local_policies() -> Callable[[Figure], None]:
         "expert, 2 hops": LocalReynolds.for_env(env_config, hops=2, action=ACTION),
         "expert, sees all": Reynolds.for_env(env_config, action=ACTION),
     }
-    flown = {name: errors(expert, env_config, flocks=100, steps=1000) for name, expert in experts.items()}
-    for name, (error, lost) in flown.items():
+    measured = {name: errors(expert, env_config, flocks=100, steps=1000) for name, expert in experts.items()}
+    for name, (error, lost) in measured.items():
         print(f"{name}: {error.mean():.3f} m²/s², at the end {error[:, -1].mean():.3f}, lost {lost[:, -1].mean():.0%}")
-    errors_of = curves({name: error for name, (error, _) in flown.items()}, env_config)
-    lost_of = curves({name: 100 * lost for name, (_, lost) in flown.items()}, env_config)
+    errors_of = curves({name: error for name, (error, _) in measured.items()}, env_config)
+    lost_of = curves({name: 100 * lost for name, (_, lost) in measured.items()}, env_config)
 
     def onto(figure: Figure) -> None:
         left, right = draw_panels(

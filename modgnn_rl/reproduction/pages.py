@@ -175,22 +175,22 @@ def _rise(results: Results, row: ModelVariant | str, settings: Mapping[str, str]
 
 
 def _flown(results: Results) -> str:
-    flown = {(setting.flocks, setting.steps) for setting in results.study.settings}
-    rollouts = sorted({flocks for flocks, _ in flown})
+    evaluated = {(setting.flocks, setting.steps) for setting in results.study.settings}
+    rollouts = sorted({flocks for flocks, _ in evaluated})
     span = f"{rollouts[0]}" if len(rollouts) == 1 else f"{rollouts[0]} to {rollouts[-1]}"
     return f"{span} episodes of {results.study.settings[0].steps} steps from the same initial states for all rows."
 
 
 def _leader_lost(results: Results, settings: Mapping[str, str]) -> Table:
-    flown = {heading: setting for heading, setting in settings.items() if setting != VALIDATION}
+    evaluated = {heading: setting for heading, setting in settings.items() if setting != VALIDATION}
     body = []
     for row in _rows(results):
-        shares = [results.values(row, setting, "leader_lost") for setting in flown.values()]
+        shares = [results.values(row, setting, "leader_lost") for setting in evaluated.values()]
         body.append([title_of(row), *("failed" if share is None else f"{share.mean():.0%}" for share in shares)])
-    best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(flown)), "low")
+    best: dict[int, Any] = dict.fromkeys(range(1, 1 + len(evaluated)), "low")
     return Table(
         "Leader lost",
-        ["model", *flown],
+        ["model", *evaluated],
         body,
         "Fraction of episodes that end with the leader out of everyone's range.",
         best,

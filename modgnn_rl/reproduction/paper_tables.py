@@ -116,8 +116,8 @@ def _about(results: Results, setting: str) -> str:
     )
     if setting == VALIDATION:
         return f"{results.config.scale.val_episodes} expert episodes that no model was trained on; {counted}."
-    flown = next(entry for entry in results.study.settings if entry.name == setting)
-    return f"{flown.flocks} episodes of {flown.steps} steps from the same initial states for all rows; {counted}."
+    episodes = next(entry for entry in results.study.settings if entry.name == setting)
+    return f"{episodes.flocks} episodes of {episodes.steps} steps from the same initial states for all rows; {counted}."
 
 
 def _paper(row: Row, *keys: Any) -> Any:

@@ -66,7 +66,7 @@ class EvalSetting:
 
 @dataclass(frozen=True)
 class Study:
-    """Models, trained alike, and settings to fly them in.
+    """Models, trained alike, and settings to evaluate them in.
 
     Attributes:
         family: studies of one family share their trainings.

@@ -1,4 +1,4 @@
-"""Collecting a dataset: stopped anywhere it goes on, and nothing is written by halves or over other things."""
+"""Collecting a dataset: it resumes wherever it was stopped, and nothing is half-written or overwritten."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return content(collect_dataset(config(tmp_path_factory.mktemp("whole") / "set")))
 
 
-def test_one_seed_fixes_the_flights_and_no_two_are_equal(tmp_path: Path, whole: dict[str, bytes]) -> None:
+def test_one_seed_fixes_the_rollouts_and_no_two_are_equal(tmp_path: Path, whole: dict[str, bytes]) -> None:
     assert content(collect_dataset(config(tmp_path / "again"))) == whole
     other = EpisodeDataset.open(collect_dataset(config(tmp_path / "other", seed=1)))
     states = torch.cat(
@@ -68,7 +68,7 @@ STOPS: list[tuple[Any, str]] = [
 
 @pytest.mark.parametrize(("module", "name"), STOPS)
 @pytest.mark.parametrize("call", [0, 2])
-def test_what_was_stopped_goes_on_to_the_same_bits(
+def test_a_stopped_collection_resumes_to_the_same_bits(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     whole: dict[str, bytes],
@@ -144,7 +144,7 @@ def test_more_episodes_are_added(
         lambda path: (path / "shard_00001" / "other").write_text(""),
     ],
 )
-def test_damaged_shards_are_flown_again(
+def test_damaged_shards_are_collected_again(
     tmp_path: Path, whole: dict[str, bytes], capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None]
 ) -> None:
     path = collect_dataset(config(tmp_path / "set"))
@@ -199,7 +199,7 @@ def test_worlds_that_positions_do_not_tell_are_refused(tmp_path: Path, setting: 
         {"physics": "bullet", "collisions": True, "start_distance": 0.0, "start_radius": 0.5},
     ],
 )
-def test_flights_do_not_depend_on_those_before(tmp_path: Path, env_config: dict[str, Any]) -> None:
+def test_rollouts_do_not_depend_on_those_before(tmp_path: Path, env_config: dict[str, Any]) -> None:
     if "physics" in env_config:
         pytest.importorskip("pybullet")
     env_config = {"env": dataclasses.replace(WORLD, **env_config), "steps": 10, "episodes": 4}
@@ -209,7 +209,7 @@ def test_flights_do_not_depend_on_those_before(tmp_path: Path, env_config: dict[
     assert content(collect_dataset(config(other, **env_config))) == content(one)
 
 
-def test_nothing_ends_a_flight() -> None:
+def test_nothing_ends_a_rollout() -> None:
     env_config = FlockingConfig(num_agents=5, max_steps=3, max_distance=0.1, max_colliding=0.01, collision_distance=9.0)
     states = rollout_expert(FlockingEnv(3, config=env_config, seed=0), 12)
     plain = rollout_expert(FlockingEnv(3, config=FlockingConfig(num_agents=5), seed=0), 12)

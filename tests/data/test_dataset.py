@@ -1,4 +1,4 @@
-"""A dataset of rollouts: what comes back is what was flown, and nothing else comes back."""
+"""A dataset of rollouts: it returns the rollouts that were stored, and nothing else."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def copy(folder: Path, tmp_path: Path) -> Path:
 
 
 def rollouts(policy: Any = None) -> TensorDict:
-    """The same rollouts, flown here by TorchRL; with the actions of a policy that looks on; [E, T]."""
+    """The same rollouts from TorchRL, with the actions of a policy that does not act; [E, T]."""
     shards = []
     for name, flocks in (("shard_00000", 2), ("shard_00001", 2), ("shard_00002", 1)):
         env = FlockingEnv(flocks, config=WORLD, seed=derive_seed(3, name))
@@ -66,36 +66,36 @@ def rollouts(policy: Any = None) -> TensorDict:
 
 
 def test_what_is_stored_is_what_the_expert_flew(folder: Path) -> None:
-    dataset, flown = EpisodeDataset.open(folder), rollouts()
+    dataset, collected = EpisodeDataset.open(folder), rollouts()
     assert (dataset.episodes, dataset.steps, dataset.num_agents, len(dataset)) == (5, 9, 6, 45)
     assert dataset.env_config == FlockingConfig(**{**vars(WORLD), "max_steps": STEPS})
     stored = torch.cat([shard["state"] for shard in dataset.shards])
-    assert torch.equal(stored, flown["agents", "observation"])
+    assert torch.equal(stored, collected["agents", "observation"])
 
 
 @pytest.mark.parametrize("length", [1, 2, 4])
 def test_windows_are_the_environments_data_and_its_experts(folder: Path, length: int) -> None:
-    dataset, flown = EpisodeDataset.open(folder), rollouts()
+    dataset, collected = EpisodeDataset.open(folder), rollouts()
     windows = dataset.windows(torch.arange(len(dataset)), length)
     assert windows.batch_size == (len(dataset), length)
     for index in range(len(dataset)):
         episode, last = divmod(index, STEPS)
         steps = torch.arange(last + 1 - length, last + 1).clamp(min=0)
         assert torch.equal(windows["is_init"][index, :, 0], steps == 0)
-        expected = flown[episode, steps]
+        expected = collected[episode, steps]
         for key in (("agents", "observation"), ("agents", "controlled"), "adjacency"):
             assert torch.equal(windows[key][index], expected[key])
         torch.testing.assert_close(windows["agents", "expert_action"][index], expected["agents", "expert_action"])
 
 
 @pytest.mark.parametrize(("name", "layers"), [("pair_force", 1), ("modgnn_mlp", 1), ("gcn", 2)])
-def test_a_policy_does_at_the_end_of_a_window_what_it_does_in_flight(folder: Path, name: str, layers: int) -> None:
+def test_a_policy_does_at_the_end_of_a_window_what_it_does_in_a_rollout(folder: Path, name: str, layers: int) -> None:
     policy = make_model(name, hops=2, layers=layers, seed=0)
-    flown, dataset = rollouts(policy), EpisodeDataset.open(folder)
+    collected, dataset = rollouts(policy), EpisodeDataset.open(folder)
     windows = dataset.windows(torch.arange(len(dataset)), policy.window)
     with set_recurrent_mode(True), torch.no_grad():
         action = policy(windows)["agents", "action"][:, -1]
-    torch.testing.assert_close(action, flown["looks_on"].flatten(0, 1), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(action, collected["looks_on"].flatten(0, 1), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("index", [[-1], [45], [0, 44, 45]])

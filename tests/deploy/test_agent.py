@@ -1,4 +1,4 @@
-"""Agents that fly alone do together what the policy does for all of them."""
+"""Agents that run alone do together what the policy does for all of them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LOCAL_STARTS = ("mask", "zero")
 
 
 class Rollout:
-    """Random observations, graphs and mishaps, flown by the policy for all agents and by the agents themselves."""
+    """Random observations, graphs and perturbations, for the policy of all agents and for agents alone."""
 
     def __init__(self, policy: ModGNN, seed: int, links: EdgeData | None = None, dtype: torch.dtype = torch.float64):
         self.policy = policy.to(dtype).eval()
@@ -45,7 +45,7 @@ class Rollout:
 
     @torch.no_grad()
     def run(self, tolerance: float = 1e-12) -> None:
-        """Fly; every action and every message of every agent is the policy's."""
+        """Roll out; every action and every message of every agent is the policy's."""
         for _ in range(STEPS):
             data = self.next_step()
             together = self.policy(data.clone())
@@ -174,7 +174,7 @@ COMMUNICATIONS: dict[str, tuple[Callable[[], nn.Module], EdgeData]] = {
     aggregation=st.sampled_from(AGGREGATIONS),
     seed=st.integers(0, 999),
 )
-def test_agents_fly_as_the_policy_does(
+def test_agents_act_as_the_policy_does(
     communication: str, hops: list[int], start: str, aggregation: str, seed: int
 ) -> None:
     make, links = COMMUNICATIONS[communication]
@@ -188,7 +188,7 @@ def test_agents_fly_as_the_policy_does(
 
 @pytest.mark.parametrize(("hops", "layers"), [(0, 1), (1, 1), (3, 1), (2, 2)])
 @pytest.mark.parametrize("name", [name for name in MODELS if name != "central"])
-def test_every_model_flies_agent_by_agent(name: str, hops: int, layers: int) -> None:
+def test_every_model_runs_agent_by_agent(name: str, hops: int, layers: int) -> None:
     Rollout(make_model(name, hops, 8, layers=layers, seed=1), seed=hops).run()
 
 
@@ -249,7 +249,7 @@ def test_the_keys_of_a_policy_say_whether_links_have_weights() -> None:
         Agent(policy(edge_feature="feature"))
 
 
-def test_nobody_is_heard_whatever_is_known_of_links() -> None:
+def test_no_agent_is_heard_whatever_edge_data_there_are() -> None:
     agent = Agent(policy(), EdgeData(weight=True, feature=2))
     agent.observe(torch.zeros(FEATURES))
     agent.receive([])

@@ -101,7 +101,7 @@ class Heard:
 
 
 def test_an_exported_agent_is_the_agent(exported: Exported) -> None:
-    """The rollout goes on over a reboot and over a step at which the agent sees nothing."""
+    """The rollout continues over a reboot and over a step at which the agent sees nothing."""
     heard, agent, robot = Heard(), Agent(everything().eval(), LINKS), OnnxAgent(exported.folder)
     program = torch.export.load(exported.folder / "agent.pt2").module()
     for step, count in enumerate(NEIGHBOURS * 2):
@@ -323,7 +323,9 @@ def with_final(f_final: nn.Module) -> ModGNN:
         (ModGNN(ModGNNLayer(1, start="repeat")), torch.float32, "start='repeat'"),
     ],
 )
-def test_a_policy_that_would_not_fly_alone(policy: ModGNN, dtype: torch.dtype, sentence: str, tmp_path: Path) -> None:
+def test_a_policy_that_cannot_run_alone_is_refused(
+    policy: ModGNN, dtype: torch.dtype, sentence: str, tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match=sentence):
         export_agent(policy, tmp_path / "agent", torch.zeros(3, dtype=dtype))
     assert not list(tmp_path.iterdir())
@@ -389,7 +391,7 @@ def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:
 
 
 @pytest.mark.slow
-def test_the_command_exports_what_the_example_flies(
+def test_the_command_exports_what_the_example_runs(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert command(monkeypatch, f"run={run.path}") == 0
@@ -404,12 +406,12 @@ def test_the_command_exports_what_the_example_flies(
     ):
         assert words in captured.out
     assert captured.err == ""
-    assert example().main(run.path, num_agents=5, steps=12) < 1e-5  # flies these files
-    assert "5 robots flew 12 steps" in capfd.readouterr().out
+    assert example().main(run.path, num_agents=5, steps=12) < 1e-5  # runs these files
+    assert "5 robots ran for 12 steps" in capfd.readouterr().out
 
 
 def example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("example", ROOT / "examples" / "fly_exported_agents.py")
+    spec = importlib.util.spec_from_file_location("example", ROOT / "examples" / "run_exported_agents.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -122,7 +122,7 @@ def test_agents_are_interchangeable_and_of_any_number(name: str) -> None:
 
 @local_models
 @torch.no_grad()
-def test_who_hears_of_nobody_knows_its_own_velocity_only(name: str) -> None:
+def test_an_agent_without_neighbours_knows_its_own_velocity_only(name: str) -> None:
     policy = make_model(name, hops=1, seed=0).double()
     observation, _ = rollout(0)
     alone = torch.zeros(2, 4, 5, 5, dtype=torch.bool)

@@ -135,7 +135,7 @@ def test_later_layers_read_what_earlier_ones_put_out_now() -> None:
 
 
 @torch.no_grad()
-def test_several_layers_fly_agent_by_agent() -> None:
+def test_several_layers_run_agent_by_agent() -> None:
     """They have no decentralised mode for more than one layer."""
     policy, data = make_policy(2, 1), random_data(6)
     agents = [Agent(policy) for _ in range(AGENTS)]
@@ -168,7 +168,7 @@ def test_moving_a_policy_returns_it() -> None:
 
 
 @torch.no_grad()
-def test_a_policy_holds_no_state_of_a_flight() -> None:
+def test_a_policy_holds_no_state_of_a_rollout() -> None:
     """They keep the messages on the module, so that one policy cannot serve two rollouts, or another batch size."""
     policy, rollouts = make_policy(2), [random_data(STEPS), random_data(3, STEPS)]
     stored = [None, None]

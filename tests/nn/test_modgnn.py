@@ -330,7 +330,7 @@ def test_forgetfulness_warns_once() -> None:
         policies()["hopless"](data.clone())
 
 
-def test_a_step_in_mid_flight_without_messages_warns() -> None:
+def test_a_step_in_mid_episode_without_messages_warns() -> None:
     data = random_data(2, agents=3)
     data["is_init"][:] = True
     with warnings.catch_warnings():

@@ -120,7 +120,7 @@ def test_only_links_carry_information_one_step_a_hop() -> None:
 
 
 @torch.no_grad()
-def test_an_agent_that_saw_nan_is_not_heard_and_starts_anew() -> None:
+def test_an_agent_that_saw_nan_is_not_heard_and_starts_again() -> None:
     layer = make_layer(hops=1)
     observation, adjacency = random_data(STEPS)
     sick = observation.clone()
@@ -149,7 +149,7 @@ def test_nan_of_one_agent_leaves_all_others_finite(start: str) -> None:
 
 @pytest.mark.parametrize("start", STARTS)
 @torch.no_grad()
-def test_nan_of_an_isolated_agent_reaches_nobody(start: str) -> None:
+def test_nan_of_an_isolated_agent_reaches_no_other_agent(start: str) -> None:
     layer = make_layer(2, start)
     observation, adjacency = random_data(STEPS)
     adjacency[:, :, 0] = adjacency[:, 0] = False

@@ -150,7 +150,7 @@ def test_specs_with_messages_hold(make: Callable[[], ModGNN]) -> None:
 
 
 @torch.no_grad()
-def test_one_policy_flies_flocks_of_any_size() -> None:
+def test_one_policy_acts_in_flocks_of_any_size() -> None:
     policy = make_model("pair_force", seed=0)
     for agents in (1, 3, 6):
         env = remembering(policy, agents)
@@ -159,7 +159,7 @@ def test_one_policy_flies_flocks_of_any_size() -> None:
 
 
 @torch.no_grad()
-def test_a_policy_without_messages_flies_in_the_same_environments() -> None:
+def test_a_policy_without_messages_acts_in_the_same_environments() -> None:
     policy = make_model("central", num_agents=AGENTS, seed=0)
     rollouts = remembering(policy).rollout(9, policy, break_when_any_done=False)
     assert rollouts["messages"].shape == (FLOCKS, 9, AGENTS, 0, 6)

@@ -140,7 +140,7 @@ def test_without_matplotlib_the_tables_are_written_all_the_same(tmp_path, monkey
     assert "[plots]" not in write_report(tmp_path, "t", [Section("s", "", [TABLE])], PROVENANCE).read_text()
 
 
-def test_a_report_that_cannot_be_drawn_leaves_the_last_one(tmp_path):
+def test_a_report_that_cannot_be_made_leaves_the_last_one(tmp_path):
     pytest.importorskip("matplotlib")
     before = write_report(tmp_path, "first", [], PROVENANCE).read_bytes()
 

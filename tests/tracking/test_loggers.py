@@ -345,7 +345,7 @@ def test_wandb_without_its_helper_is_off_with_one_warning_and_does_not_harm_the_
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the helper process through ps")
 @pytest.mark.usefixtures("clean_wandb")
-def test_training_goes_on_without_wandb_and_metrics_are_complete(tmp_path):
+def test_training_continues_without_wandb_and_metrics_are_complete(tmp_path):
     class Kill(Callback):
         def on_round(self, index, metrics):
             for helper in wandb_helpers() if index == 2 else ():

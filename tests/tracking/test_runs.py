@@ -329,7 +329,7 @@ def command(*arguments, **options):
     return subprocess.Popen([sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True, **options)
 
 
-def test_the_command_needs_no_torch_and_heeds_a_closed_pipe(tmp_path):
+def test_the_command_needs_no_torch_and_stops_at_a_closed_pipe(tmp_path):
     for number in range(3):
         make_run(tmp_path, f"run{number}")
     process = command(f"runs={tmp_path}", "format=json", stdout=subprocess.PIPE)

@@ -296,7 +296,7 @@ def test_a_phone_shows_all_of_it_and_every_control_acts_by_touch(page):
 
 @pytest.mark.slow
 @needs_chromium
-def test_a_thousand_agents_are_drawn(tmp_path):
+def test_a_thousand_agents_are_shown(tmp_path):
     env_config = FlockingConfig(num_agents=1000, start_radius=12.0, graph="links", comm_range=2.0)
     page = _page(tmp_path, env_config, ("expert",), agents=1000, steps=4)
     with browser.Browser() as window:

@@ -504,10 +504,10 @@ def test_episodes_start_at_given_states() -> None:
     state = torch.randn(3, 4, 6, generator=torch.Generator().manual_seed(0))
     td = env.reset(TensorDict({"agents": {"state": state}}, [3]), set_state=True)
     assert torch.equal(td["agents", "observation"], state)
-    flown = env.rollout(5, constant_policy(1.0))[:, -1]["next"]
-    again = FlockingEnv(3, 4, seed=9).reset(flown.clone(), set_state=True)  # where another rollout ended
-    assert torch.equal(again["agents", "observation"], flown["agents", "observation"])
-    assert not torch.equal(env.reset(flown.clone())["agents", "observation"], flown["agents", "observation"])
+    ended = env.rollout(5, constant_policy(1.0))[:, -1]["next"]
+    again = FlockingEnv(3, 4, seed=9).reset(ended.clone(), set_state=True)  # where another rollout ended
+    assert torch.equal(again["agents", "observation"], ended["agents", "observation"])
+    assert not torch.equal(env.reset(ended.clone())["agents", "observation"], ended["agents", "observation"])
 
 
 def test_some_flocks_start_at_given_states() -> None:

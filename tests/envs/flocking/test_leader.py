@@ -22,38 +22,38 @@ def lead(steps: int, position: Tensor | None = None, **settings: Any) -> tuple[L
     generator = torch.Generator().manual_seed(0)
     leader.reset(EVERYBODY, generator)
     position = torch.zeros(len(EVERYBODY), 3, dtype=torch.float64) if position is None else position
-    flown = []
+    velocities = []
     for _ in range(steps):
         velocity = leader.step(position, generator)
         position = position + velocity / config.control_frequency
-        flown.append(velocity)
-    return leader, torch.stack(flown)
+        velocities.append(velocity)
+    return leader, torch.stack(velocities)
 
 
 def test_noise_is_a_random_walk_of_the_velocity_from_rest() -> None:
-    _, flown = lead(480, leader_noise=0.1, leader_max_speed=torch.inf)
-    variance = flown.square().mean((1, 2))
+    _, velocities = lead(480, leader_noise=0.1, leader_max_speed=torch.inf)
+    variance = velocities.square().mean((1, 2))
     seconds = torch.arange(1, 481) / 48
     # 1,500 walks: the standard error of a variance is 4 %.
     torch.testing.assert_close(variance, 0.01 * seconds.double(), rtol=0.15, atol=0)
 
 
 def test_noise_stays_in_its_ball() -> None:
-    _, flown = lead(480, leader_noise=1.0, leader_max_speed=0.5)
-    assert float(flown.norm(dim=-1).max()) == pytest.approx(0.5)
+    _, velocities = lead(480, leader_noise=1.0, leader_max_speed=0.5)
+    assert float(velocities.norm(dim=-1).max()) == pytest.approx(0.5)
 
 
 def test_a_circle_closes() -> None:
     radius, speed = 2.0, 0.5
     steps = round(2 * torch.pi * radius / speed * 48)
-    _, flown = lead(steps, leader="circle", leader_radius=radius, leader_speed=speed)
-    path = (flown / 48).cumsum(0)
-    torch.testing.assert_close(flown.norm(dim=-1), torch.full_like(flown[..., 0], speed))
+    _, velocities = lead(steps, leader="circle", leader_radius=radius, leader_speed=speed)
+    path = (velocities / 48).cumsum(0)
+    torch.testing.assert_close(velocities.norm(dim=-1), torch.full_like(velocities[..., 0], speed))
     assert float(path[-1].norm(dim=-1).max()) < 0.02
-    assert not flown[..., 2].any()
+    assert not velocities[..., 2].any()
     centre = path.mean(0)
     torch.testing.assert_close((path - centre).norm(dim=-1), torch.full_like(path[..., 0], radius), rtol=0.01, atol=0)
-    headings = torch.atan2(flown[0, :, 1], flown[0, :, 0])
+    headings = torch.atan2(velocities[0, :, 1], velocities[0, :, 0])
     assert float(headings.std()) > 1.5  # initial headings in all directions
 
 

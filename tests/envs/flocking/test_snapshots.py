@@ -87,7 +87,7 @@ def test_rollouts_continue_bit_for_bit(name: str) -> None:
 def test_agents_in_contact_continue_up_to_rounding_in_bullet() -> None:
     """Agents pushed together: a snapshot does not hold Bullet's record of contacts.
 
-    So a rollout that goes on from it is not the old one to the last bit, but the same in whichever engine.
+    So a rollout that continues from it is not the old one to the last bit, but the same in whichever engine.
     """
     engine, one, other = (BulletPhysics(1, 6, collisions=True, dtype=torch.float64) for _ in range(3))
     generator = torch.Generator().manual_seed(0)
@@ -101,8 +101,8 @@ def test_agents_in_contact_continue_up_to_rounding_in_bullet() -> None:
         restored.restore(engine.snapshot())
     for _ in range(24):
         target = -3.0 * engine.position
-        for flown in (engine, one, other):
-            flown.step(target)
+        for stepped in (engine, one, other):
+            stepped.step(target)
         assert torch.equal(one.position, other.position)
         torch.testing.assert_close(one.position, engine.position, rtol=0, atol=1e-4)
     assert not torch.equal(one.position, engine.position)

@@ -67,7 +67,7 @@ def random_start(flocks: int, agents: int, *, spin: float, seed: int = 0) -> lis
 def compare(options: dict[str, Any], *, seconds: int, wind: float = 0.0, seed: int = 1) -> dict[torch.dtype, float]:
     """Largest distance of agents in torch from those in PyBullet, m, while targets change every second.
 
-    It depends on the start by what tumbling makes of a rounding error: from seed 0, two flights in torch that start
+    It depends on the start by what tumbling makes of a rounding error: from seed 0, two rollouts in torch that start
     one rounding error apart are 1e-12 m apart after 20 s, as are PyBullet's and torch's.
     """
     flocks, agents = 2, 4
@@ -100,7 +100,7 @@ def compare(options: dict[str, Any], *, seconds: int, wind: float = 0.0, seed: i
     return worst
 
 
-# The same flights
+# The same rollouts
 
 
 @pytest.mark.parametrize("name", ["none", "ground", "all"])

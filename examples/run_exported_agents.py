@@ -1,7 +1,7 @@
-"""Fly a flock in which every robot runs its own exported agent, and compare it with the policy that flies all at once.
+"""Roll out a flock whose robots each run an exported agent, and compare them with the policy for all of them.
 
-    python examples/fly_exported_agents.py                       # a policy with random weights, exported now
-    python examples/fly_exported_agents.py 'runs/<date>-<name>'  # what modgnn_rl.export made of a run
+    python examples/run_exported_agents.py                       # a policy with random weights, exported now
+    python examples/run_exported_agents.py 'runs/<date>-<name>'  # what modgnn_rl.export made of a run
 
 A robot gets its own observation and the messages of the robots that it hears; what carries them is the loop below.
 Needs the extra ``export``.
@@ -28,7 +28,7 @@ from modgnn_rl.tracking.run_folder import RunFolder
 
 @torch.no_grad()
 def rollout(policy: ModGNN, env_config: FlockingConfig, folder: Path, num_agents: int, steps: int) -> float:
-    """Fly one flock with the agents in ``folder``; returns the largest difference from the policy's actions, m/s."""
+    """Roll out one flock with the agents in ``folder``; returns the largest difference from its actions, m/s."""
     env = TransformedEnv(FlockingEnv(1, num_agents, config=env_config, seed=0), InitTracker())
     env.append_transform(policy.make_tensordict_primer())
     robots = [OnnxAgent(folder) for _ in range(num_agents)]
@@ -44,7 +44,7 @@ def rollout(policy: ModGNN, env_config: FlockingConfig, folder: Path, num_agents
             robot.receive([messages[sender] for sender in heard.nonzero()[0]])
         actions = np.stack([robot.act() for robot in robots])
 
-        state = policy(state)  # remembers its messages; the robots fly
+        state = policy(state)  # updates its messages; the robots act
         difference = max(difference, float(np.abs(actions - state["agents", "action"][0].numpy()).max()))
         state["agents", "action"] = torch.from_numpy(actions).unsqueeze(0)
         _, state = env.step_and_maybe_reset(state)
@@ -52,7 +52,7 @@ def rollout(policy: ModGNN, env_config: FlockingConfig, folder: Path, num_agents
 
 
 def main(run: Path | None = None, num_agents: int = 16, steps: int = 240) -> float:
-    """Fly the agents of a run, which ``python -m modgnn_rl.export run=<folder>`` made; or export some and fly them."""
+    """Run the agents that ``python -m modgnn_rl.export run=<folder>`` made, or export some first."""
     with tempfile.TemporaryDirectory() as scratch:
         if run is None:
             env_config, policy, folder = (
@@ -64,7 +64,7 @@ def main(run: Path | None = None, num_agents: int = 16, steps: int = 240) -> flo
         else:
             env_config, policy, folder = load_env_config(RunFolder.open(run)), load_policy(run), run / "agent"
         difference = rollout(policy, env_config, folder, num_agents, steps)
-    print(f"{num_agents} robots flew {steps} steps; largest difference of an action: {difference:.1e} m/s")
+    print(f"{num_agents} robots ran for {steps} steps; largest difference of an action: {difference:.1e} m/s")
     return difference
 
 
