@@ -48,7 +48,7 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.layout import Layout
 from modgnn_rl.registry import METRICS, TASKS
 from modgnn_rl.task_env import ACTION, EXPERT_ACTION, OBSERVATION, REWARD, ExpertLabels, Probe, TaskEnv, probe
-from modgnn_rl.visualization.recording import Frame
+from modgnn_rl.visualization.recording import NO_MARKS, Frame
 
 __all__ = ["ACTION", "EXPERT_ACTION", "OBSERVATION", "REWARD", "CriticInput", "Task", "edge_array", "make_task"]
 
@@ -85,6 +85,7 @@ class Task:
         frequency: steps a second, for replays and exported agents, Hz.
         leader: index of an agent that replays mark; None: none.
         yardstick: name of the reference policy that evaluations compare errors with; None: none.
+        arrow_name: what the arrows of replays are.
         max_arrow: length of the longest arrow that replays draw; None: the longest of the recording.
     """
 
@@ -95,6 +96,7 @@ class Task:
     frequency = 10.0
     leader: int | None = None
     yardstick: str | None = None
+    arrow_name = "action"
     max_arrow: float | None = None
 
     def __init__(self, config: Any) -> None:
@@ -194,6 +196,11 @@ class Task:
     def group_name(self) -> str | None:
         """The environment's own name of the group of agents."""
         return self._probe.group
+
+    @property
+    def dims(self) -> int:
+        """Dimension of the space that replays show."""
+        return self.layout.dims
 
     @property
     def sizes(self) -> list[int]:
@@ -305,12 +312,14 @@ class Task:
         position = self.positions(data)
         if position is None:
             raise InputError(f"task '{self.name}' has no positions to draw; define positions(data) in {type(self)}")
-        arrows, controlled = self.arrows(data), data["agents", "controlled"]
+        arrows, targets, controlled = self.arrows(data), self.targets(data), data["agents", "controlled"]
         return Frame(
             position=_in_space(position),
-            target_velocity=_in_space(torch.zeros_like(position) if arrows is None else arrows).astype(np.float32),
+            arrow=_in_space(torch.zeros_like(position) if arrows is None else arrows).astype(np.float32),
             edges=edge_array(data["adjacency"]),
             present=data.get(("agents", "mask"), torch.ones_like(controlled)).cpu().numpy(),
+            marks=NO_MARKS if targets is None else _in_space(targets),
+            leader=self.leader,
         )
 
     @functools.cached_property

@@ -155,12 +155,10 @@ class TaskEnv(EnvBase):
 
     def _make_specs(self) -> None:
         observed = self.base.full_observation_spec.clone()
-        agents = observed[self._group] if self._group is not None else Composite(shape=self.batch_size)
-        if self._group is not None:
-            del observed[self._group]
-        else:
-            agents["observation"] = observed["observation"]
-            del observed["observation"]
+        name = "observation" if self._group is None else self._group
+        given = {name: observed[name]} if self._group is None else dict(observed[name].items())
+        agents = Composite(given, shape=self.batch_size)
+        del observed[name]
         actions = probe(self.task, self.base).actions
         shape = (*self.batch_size, self.num_agents)
         found = tuple(agents["observation"].shape)

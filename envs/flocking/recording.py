@@ -20,7 +20,7 @@ def flock_frame(flock: TensorDictBase, config: FlockingConfig) -> Frame:
         config: settings of the environment.
 
     Returns:
-        the frame; its target velocities are those the environment uses: actions projected onto the ball of
+        the frame; its arrows are the target velocities the environment uses: actions projected onto the ball of
         ``max_speed``, zero for agents that have dropped out, and for the leader its velocity.
     """
     agents = flock["agents"]
@@ -31,7 +31,8 @@ def flock_frame(flock: TensorDictBase, config: FlockingConfig) -> Frame:
     speed = target.norm(dim=-1, keepdim=True).clamp(min=config.max_speed)
     return Frame(
         position=position.double().cpu().numpy(),
-        target_velocity=(target * config.max_speed / speed).float().cpu().numpy(),
+        arrow=(target * config.max_speed / speed).float().cpu().numpy(),
         edges=edge_array(flock["adjacency"]),
         present=agents.get("mask", torch.ones_like(controlled)).cpu().numpy(),
+        leader=0,
     )

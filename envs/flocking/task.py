@@ -36,6 +36,7 @@ class FlockingTask(Task):
     bootstraps_at_termination = True
     min_agents = 2  # the leader is not trained
     leader = 0
+    arrow_name = "target velocity"
     yardstick = "local expert (1 hop)"
     layout = STATE
 

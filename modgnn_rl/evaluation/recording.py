@@ -35,7 +35,7 @@ class Recorder:
 
     def __init__(self, task: Task, stride: int = 1, flock: int = 0) -> None:
         self.task, self.stride, self.flock = task, stride, flock
-        self.steps = 0
+        self.steps, self.is_over = 0, False
         plotted = [name for name in task.metrics if METRICS[name].options.get("replay")]
         positions_only = ("position",)
         self._of_positions = [
@@ -45,15 +45,17 @@ class Recorder:
         self._recorded: dict[str, list[Array]] = defaultdict(list)
 
     def __call__(self, tensordict: TensorDictBase) -> None:
-        """Record the state before a step, with the policy's and the expert's actions."""
-        if self.steps % self.stride == 0:
+        """Record the state before a step, with the policy's and the expert's actions, until the episode is over."""
+        self.is_over |= self.steps > 0 and bool(tensordict["is_init"][self.flock])
+        if not self.is_over and self.steps % self.stride == 0:
             flock = tensordict[self.flock]
             frame = self.task.frame(flock)
             quanta = quantise(frame.position)
             metrics = compute_metrics(self._of_steps, self.task.config, self.task.measured(flock))
             step = {
                 "position": quanta,
-                "target_velocity": frame.target_velocity,
+                "arrow": frame.arrow,
+                "marks": quantise(frame.marks),
                 "present": frame.present,
                 "flips": range_flips(frame.edges, quanta, frame.present, self.task.comm_range),
                 **{name: value.cpu().numpy() for name, value in metrics.items()},
@@ -69,10 +71,10 @@ class Recorder:
         metrics = compute_metrics(self._of_positions, self.task.config, {"position": metres})
         values = {name: np.stack(self._recorded[name]) for name in self._of_steps}
         values |= {name: value.reshape(len(value), -1).mean(-1).numpy() for name, value in metrics.items()}
-        arrows = np.stack(self._recorded["target_velocity"])
+        arrows, marks = np.stack(self._recorded["arrow"]), np.stack(self._recorded["marks"])
         return Recording(
             position=position,
-            target_velocity=arrows,
+            arrow=arrows,
             present=np.stack(self._recorded["present"]),
             flips=self._recorded["flips"],
             metrics={
@@ -84,8 +86,12 @@ class Recorder:
             },
             stride=self.stride,
             comm_range=self.task.comm_range,
-            max_speed=self.task.max_arrow or max(1e-6, float(np.linalg.norm(arrows, axis=-1).max())),
+            max_arrow=self.task.max_arrow or max(1e-6, float(np.linalg.norm(arrows, axis=-1).max())),
             frequency=self.task.frequency,
+            marks=marks if marks.shape[1] else None,
+            leader=self.task.leader,
+            dims=self.task.dims,
+            arrow_name=self.task.arrow_name if arrows.any() else "",
         )
 
 

@@ -1,8 +1,8 @@
 """Recordings as one HTML file that plays them in a browser, offline and without any installation.
 
 The page, ``replay.html``, holds each recording as a gzip stream in base64. Values change little from step to step, so
-the stream holds second differences of positions and first differences of velocities, zigzag coded (0, -1, 1, -2, ... as
-0, 1, 2, 3, ...), one plane per byte. The page computes edges from positions and flips those listed in the stream.
+the stream holds second differences of positions and first differences of arrows and marks, zigzag coded (0, -1, 1, -2,
+... as 0, 1, 2, 3, ...), one plane per byte. The page computes edges from positions and flips those that are listed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["pack", "replay_page", "write_replay"]
 Array = NDArray[Any]
 
 TEMPLATE = Path(__file__).with_name("replay.html")
-VELOCITY_STEPS = 127  # quantisation steps of velocity components, from zero to the maximum speed
+ARROW_STEPS = 127  # quantisation steps of the components of arrows, from zero to the longest
 
 
 def write_replay(
@@ -40,7 +40,7 @@ def write_replay(
 
     Args:
         path: the file; its folder must exist.
-        recordings: of equal length and size, by the name of the acting policy; the first two are shown initially.
+        recordings: of equal size, by the name of the acting policy; the first two are shown initially.
         title: heading of the page.
         facts: further information on the rollout, by name.
     """
@@ -50,7 +50,8 @@ def write_replay(
 def replay_page(recordings: Mapping[str, Recording], title: str, facts: Mapping[str, Any]) -> str:
     """The HTML of the page, see `write_replay`."""
     first = next(iter(recordings.values()))
-    steps, agents = first.present.shape
+    agents = first.present.shape[1]
+    steps = max(map(len, recordings.values()))  # an episode that ends early holds its last frame
     content = {
         "agents": agents,
         "frames": steps,
@@ -58,12 +59,21 @@ def replay_page(recordings: Mapping[str, Recording], title: str, facts: Mapping[
         "frequency": first.frequency,
         "range": first.comm_range if np.isfinite(first.comm_range) else None,
         "quantum": QUANTUM,
-        "max_speed": first.max_speed,
-        "velocity_steps": VELOCITY_STEPS,
+        "max_arrow": max(recording.max_arrow for recording in recordings.values()),
+        "arrow": first.arrow_name,
+        "leader": -1 if first.leader is None else first.leader,
+        "dims": first.dims,
+        "marks": 0 if first.marks is None else first.marks.shape[1],
+        "arrow_steps": ARROW_STEPS,
         "metrics": [[name, series.title, series.unit] for name, series in first.metrics.items()],
         "facts": {name: str(value) for name, value in facts.items()},
         "rollouts": [
-            {"name": name, "data": base64.b64encode(pack(recording)).decode()} for name, recording in recordings.items()
+            {
+                "name": name,
+                "frames": len(recording),
+                "data": base64.b64encode(pack(recording.extended(steps))).decode(),
+            }
+            for name, recording in recordings.items()
         ],
     }
     # Inside a script element, only "<" could end the JSON.
@@ -75,18 +85,20 @@ def replay_page(recordings: Mapping[str, Recording], title: str, facts: Mapping[
 def pack(recording: Recording) -> bytes:
     """Encode a recording of N agents, T steps and M metrics as a gzip stream.
 
-    Its parts are, in this order: positions, 4 byte planes [3, N, T]; velocities, in `VELOCITY_STEPS`, 2 byte planes
-    [3, N, T]; presence [N, T]; metrics, float32 [M, T]; and for each step the number of flips and the differences
-    between consecutive flips, as variable-length integers of seven bits per byte, lowest first, in which all bytes but
-    the last have the eighth bit set.
+    Its parts are, in this order: positions, 4 byte planes [3, N, T]; arrows, in `ARROW_STEPS`, 2 byte planes [3, N, T];
+    marks, 4 byte planes [3, P, T]; presence [N, T]; metrics, float32 [M, T]; and for each step the number of flips and
+    the differences between consecutive flips, as variable-length integers of seven bits per byte, lowest first, all
+    bytes but the last of which have the eighth bit set.
     """
-    scale = VELOCITY_STEPS / recording.max_speed
+    scale = ARROW_STEPS / recording.max_arrow
     position = recording.position.astype(np.int64).transpose(2, 1, 0)
-    velocity = (recording.target_velocity * scale).round().astype(np.int64).transpose(2, 1, 0)
-    metrics = np.stack([series.values for series in recording.metrics.values()]).astype("<f4")
+    arrow = (recording.arrow * scale).round().astype(np.int64).transpose(2, 1, 0)
+    marks = np.zeros((len(recording), 0, 3), np.int64) if recording.marks is None else recording.marks.astype(np.int64)
+    metrics = np.array([series.values for series in recording.metrics.values()], "<f4")
     parts = (
         _planes(_differences(_differences(position)), 4),
-        _planes(_differences(velocity), 2),
+        _planes(_differences(arrow), 2),
+        _planes(_differences(marks.transpose(2, 1, 0)), 4),
         recording.present.T.astype(np.uint8).tobytes(),
         metrics.tobytes(),
         _flip_bytes(recording.flips),

@@ -1,4 +1,4 @@
-"""A still image of recorded rollouts, for papers: agents, edges, target velocities, trails, the leader as a star."""
+"""A still image of recorded rollouts, for papers: agents, edges, arrows, trails, a leader as a star."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write_image(path: str | os.PathLike[str], recordings: Mapping[str, Recording
     Args:
         path: the file; its suffix is ``.svg``, ``.png`` or another that matplotlib writes, and its folder must exist.
         recordings: by the name of the acting policy.
-        index: index of the step among the recorded ones.
+        index: index of the step among the recorded ones; an episode that has ended shows its last one.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -48,7 +48,7 @@ def write_image(path: str | os.PathLike[str], recordings: Mapping[str, Recording
             axes.set_axis_off()
             axes.set_aspect("equal")
             axes.set_title(f"{name}, {index * recording.period:.1f} s", fontsize=11, color=COLOURS["agent"])
-            panels.append((axes, _draw(axes, recording, index)))
+            panels.append((axes, _draw(axes, recording, min(index, len(recording) - 1))))
         extent = 1.04 * max(extent for _, extent in panels)
         for axes, _ in panels:
             axes.set(xlim=(-extent, extent), ylim=(-extent, extent))
@@ -62,9 +62,10 @@ def _draw(axes: Any, recording: Recording, index: int) -> float:
     """Draw one flock around its centre; return the largest coordinate drawn, m."""
     begin = max(0, index - round(TRAIL / recording.period))
     metres = recording.position[begin : index + 1].astype(np.float64) * QUANTUM
-    paths = (metres - metres[-1].mean(0)) @ _view_plane()  # [T, N, 2]
+    plane = _view_plane(recording.dims)
+    paths = (metres - metres[-1].mean(0)) @ plane  # [T, N, 2]
     frame = recording.frame(index)
-    spots, tips = paths[-1], frame.target_velocity.astype(np.float64) @ _view_plane()
+    spots, tips = paths[-1], frame.arrow.astype(np.float64) @ plane
     pairs = shortest_edges(frame, MAX_EDGES)
     length = np.linalg.norm(frame.position[pairs[:, 0]] - frame.position[pairs[:, 1]], axis=-1)
     bounds = (0.0, 0.4, 0.7, 1.01)
@@ -74,17 +75,22 @@ def _draw(axes: Any, recording: Recording, index: int) -> float:
         axes.plot(*_strokes(spots[some]).T, color=COLOURS["edge"], linewidth=0.6, alpha=alpha, zorder=1)
     axes.plot(*_strokes(paths[::4].swapaxes(0, 1)).T, color=COLOURS["trail"], linewidth=0.9, alpha=0.8, zorder=2)
     arrows = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.0055, "headwidth": 3.6, "headlength": 4.2}
-    for some, colour in ((slice(1, None), "target"), (slice(0, 1), "leader")):
+    leads = np.arange(len(spots)) == (-1 if recording.leader is None else recording.leader)
+    for some, colour in ((~leads, "target"), (leads, "leader")):
         axes.quiver(*spots[some].T, *tips[some].T, color=COLOURS[colour], zorder=3, **arrows)
     size = 5.5 * min(1.0, (32 / len(spots)) ** (1 / 3)) + 0.5
     white = {"markeredgecolor": "white", "markeredgewidth": 0.6, "linestyle": "none"}
-    axes.plot(*spots[1:].T, marker="o", markersize=size, color=COLOURS["agent"], zorder=4, **white)
-    axes.plot(*spots[:1].T, marker="*", markersize=17, color=COLOURS["leader"], zorder=5, **white)
+    axes.plot(*spots[~leads].T, marker="o", markersize=size, color=COLOURS["agent"], zorder=4, **white)
+    marks = (frame.marks - metres[-1].mean(0)) @ plane
+    axes.plot(*marks.T, marker="+", markersize=9, color=COLOURS["leader"], linestyle="none", zorder=4)
+    axes.plot(*spots[leads].T, marker="*", markersize=17, color=COLOURS["leader"], zorder=5, **white)
     return float(np.abs(np.concatenate((spots, spots + tips))).max())
 
 
-def _view_plane() -> Array:
-    """The image's axes in the world frame, [3, 2]."""
+def _view_plane(dims: int) -> Array:
+    """The image's axes in the world frame, [3, 2]: seen from above if space has fewer than three dimensions."""
+    if dims < 3:
+        return np.eye(3)[:, :2]
     right = np.array((-np.sin(YAW), np.cos(YAW), 0.0))
     up = np.array((-np.sin(PITCH) * np.cos(YAW), -np.sin(PITCH) * np.sin(YAW), np.cos(PITCH)))
     return np.stack((right, up), 1)

@@ -5,6 +5,7 @@ A `Frame` is one step; a `Recording` holds the frames of a rollout compactly.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -29,24 +30,29 @@ Array = NDArray[Any]
 
 QUANTUM = 2.0**-10  # m; positions are stored as multiples of it, so that all programs compute the same distances
 MAX_QUANTA = 2**28  # agents farther away are drawn at this distance
+NO_MARKS: Array = np.zeros((0, 3))
 MAX_STATES = 200_000  # default limit of agents x steps in a recording
 
 
 class Frame(NamedTuple):
-    """N agents at one step; agent 0 is the leader.
+    """N agents at one step.
 
     Attributes:
         position: m [N, 3]; agents with a NaN are not drawn.
-        target_velocity: m/s [N, 3], drawn as arrows.
+        arrow: vectors drawn at the agents, such as target velocities, m/s [N, 3].
         edges: receiver and sender of each communication edge, int64 [E, 2].
         present: agents that have not dropped out, bool [N].
+        marks: places to mark, such as goals, m [M, 3].
+        leader: index of the agent that is shown as a star; None: no agent.
         quaternion: attitudes from body to world, x, y, z, w [N, 4]; None: level.
     """
 
     position: Array
-    target_velocity: Array
+    arrow: Array
     edges: Array
     present: Array
+    marks: Array = NO_MARKS
+    leader: int | None = None
     quaternion: Array | None = None
 
 
@@ -66,30 +72,38 @@ class MetricSeries(NamedTuple):
 
 @dataclass(frozen=True)
 class Recording:
-    """A rollout of N agents, the leader first, at T steps.
+    """A rollout of N agents at T steps.
 
     Attributes:
         position: in multiples of `QUANTUM`, int32 [T, N, 3].
-        target_velocity: m/s, within the ball of ``max_speed`` [T, N, 3].
+        arrow: vectors drawn at the agents, none longer than ``max_arrow`` [T, N, 3].
         present: agents that have not dropped out, bool [T, N].
         flips: for each step, the edges by which the graph differs from "all present agents within ``comm_range``", see
             `range_flips`.
         metrics: by name.
         stride: control steps from one recorded step to the next.
         comm_range: m.
-        max_speed: m/s.
-        frequency: control frequency, Hz.
+        max_arrow: length of the longest arrow.
+        frequency: steps a second, Hz.
+        marks: places to mark, in multiples of `QUANTUM`, int32 [T, M, 3]; default: none.
+        leader: index of the agent that is shown as a star; None: no agent.
+        dims: dimension of the task's space; with fewer than three, rollouts are shown from above.
+        arrow_name: what the arrows are; empty: there are none.
     """
 
     position: Array
-    target_velocity: Array
+    arrow: Array
     present: Array
     flips: list[Array]
     metrics: dict[str, MetricSeries]
     stride: int
     comm_range: float
-    max_speed: float
+    max_arrow: float
     frequency: float
+    marks: Array | None = None
+    leader: int | None = None
+    dims: int = 3
+    arrow_name: str = "action"
 
     def __len__(self) -> int:
         return len(self.position)
@@ -105,7 +119,31 @@ class Recording:
         near = _edges_in_range(quanta, present, self.comm_range)
         codes = np.setxor1d(near, self.flips[index], assume_unique=True)
         edges = np.stack((codes // len(quanta), codes % len(quanta)), -1)
-        return Frame(quanta.astype(np.float64) * QUANTUM, self.target_velocity[index], edges, present)
+        marks = NO_MARKS if self.marks is None else self.marks[index] * QUANTUM
+        metres = quanta.astype(np.float64) * QUANTUM
+        return Frame(metres, self.arrow[index], edges, present, marks, self.leader)
+
+    def extended(self, steps: int) -> Recording:
+        """The recording with its last frame repeated, so that it has as many steps as a longer one."""
+        more = steps - len(self)
+        if more <= 0:
+            return self
+
+        def repeat(values: Array) -> Array:
+            return np.concatenate((values, np.repeat(values[-1:], more, 0)))
+
+        return dataclasses.replace(
+            self,
+            position=repeat(self.position),
+            arrow=np.concatenate((self.arrow, np.zeros((more, *self.arrow.shape[1:]), self.arrow.dtype))),
+            present=repeat(self.present),
+            flips=[*self.flips, *[self.flips[-1]] * more],
+            marks=None if self.marks is None else repeat(self.marks),
+            metrics={
+                name: series._replace(values=np.concatenate((series.values, np.full(more, np.nan))))
+                for name, series in self.metrics.items()
+            },
+        )
 
 
 def recording_stride(num_agents: int, steps: int, max_frames: int | None = None) -> int:

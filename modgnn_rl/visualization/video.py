@@ -103,12 +103,16 @@ def _images(recording: Recording) -> Iterator[Array]:
     figure = Figure(figsize=(SIZE[0] / DPI, SIZE[1] / DPI), dpi=DPI)
     figure.subplots_adjust(0.06, 0.1, 0.99, 0.94, 0.12)
     canvas = FigureCanvasAgg(figure)
-    panels = [_Panel(figure.add_subplot(1, 2, column + 1), name, 1.1 * radius) for column, name in enumerate(VIEWS)]
+    views = list(VIEWS)[: 1 if recording.dims < 3 else None]
+    panels = [
+        _Panel(figure.add_subplot(1, len(views), column + 1), name, 1.1 * radius) for column, name in enumerate(views)
+    ]
     clock = panels[0].axes.text(0.02, 0.97, "", transform=panels[0].axes.transAxes, va="top", animated=True)
     canvas.draw()
     background = canvas.copy_from_bbox(figure.bbox)
     for index in range(len(recording)):
-        frame = recording.frame(index)._replace(position=position[index] - centres[index])
+        frame = recording.frame(index)
+        frame = frame._replace(position=position[index] - centres[index], marks=frame.marks - centres[index])
         canvas.restore_region(background)
         for panel in panels:
             panel.draw(frame)
@@ -135,19 +139,23 @@ class _Panel:
             axes.plot([], [], style, animated=True, **looks)[0]
             for style, looks in (
                 ("-", {"color": "#e3b505", "linewidth": 0.6, "alpha": 0.5}),  # edges
-                ("-", {"color": "#1f5fbf", "linewidth": 1.2}),  # target velocities
+                ("-", {"color": "#1f5fbf", "linewidth": 1.2}),  # arrows
                 ("o", {"color": "#14213d", "markersize": 4}),  # agents
                 ("*", {"color": "#c1292e", "markersize": 12}),  # leader
+                ("+", {"color": "#c1292e", "markersize": 9}),  # marks
             )
         ]
 
     def draw(self, frame: Frame) -> None:
         """Draw one frame."""
         position = frame.position[:, self.plane]
-        targets = position + frame.target_velocity[:, self.plane]
+        tips = position + frame.arrow[:, self.plane]
+        leads = np.arange(len(position)) == (-1 if frame.leader is None else frame.leader)
         edges = position[shortest_edges(frame, MAX_EDGES)]
-        lines = (_strokes(edges), _strokes(np.stack((position, targets), 1)))
-        for artist, points in zip(self.artists, (*lines, position[1:], position[:1]), strict=True):
+        lines = (_strokes(edges), _strokes(np.stack((position, tips), 1)))
+        for artist, points in zip(
+            self.artists, (*lines, position[~leads], position[leads], frame.marks[:, self.plane]), strict=True
+        ):
             artist.set_data(*points.T)
             self.axes.draw_artist(artist)
 

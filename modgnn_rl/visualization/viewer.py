@@ -88,13 +88,20 @@ class Viewer:
 
     def _draw(self, frame: Frame) -> None:
         position = frame.position - (frame.position.mean(0) if self.follows.value else 0.0)
-        position, target = position.astype(np.float32), frame.target_velocity.astype(np.float32)
+        position, arrow = position.astype(np.float32), frame.arrow.astype(np.float32)
+        leads = np.arange(len(position)) == (-1 if frame.leader is None else frame.leader)
         pairs = shortest_edges(frame, MAX_EDGES if self.shows_edges.value else 0)
         scene = self.server.scene
         with self.server.atomic():
-            scene.add_point_cloud("/agents", position[1:], COLOURS["agent"], point_size=0.12, point_shape="circle")
-            scene.add_point_cloud("/leader", position[:1], COLOURS["leader"], point_size=0.24, point_shape="diamond")
-            for name, lines in (("edge", position[pairs]), ("target", np.stack((position, position + target), 1)[1:])):
+            scene.add_point_cloud("/agents", position[~leads], COLOURS["agent"], point_size=0.12, point_shape="circle")
+            if leads.any():
+                scene.add_point_cloud(
+                    "/leader", position[leads], COLOURS["leader"], point_size=0.24, point_shape="diamond"
+                )
+            for name, lines in (
+                ("edge", position[pairs]),
+                ("target", np.stack((position, position + arrow), 1)[~leads]),
+            ):
                 self._add_lines(name, lines)
 
     def _add_lines(self, name: str, lines: NDArray[Any]) -> None:

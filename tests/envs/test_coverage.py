@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import pytest
 import torch
@@ -14,8 +15,8 @@ from modgnn_rl.evaluation.rollout import rollout
 from modgnn_rl.experiment.training import train
 from modgnn_rl.tracking.loading import load_policy, load_task
 
-SMALL = {"num_envs": 2, "steps_per_round": 4, "rounds": 2}
-IMITATION = {"cloning_steps": 8, "cloning_updates": 2, "batch_size": 8, "num_val_envs": 1}
+SMALL: dict[str, Any] = {"num_envs": 2, "steps_per_round": 4, "rounds": 2}
+IMITATION: dict[str, Any] = {"cloning_steps": 8, "cloning_updates": 2, "batch_size": 8, "num_val_envs": 1}
 
 
 def test_cells_are_the_points_nearest_to_each_robot():

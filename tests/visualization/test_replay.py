@@ -104,18 +104,18 @@ def test_packing_is_lossless(agents):
     random, steps, pairs = np.random.default_rng(0), 9, agents**2
     recording = Recording(
         position=random.integers(-(2**28), 2**28, (steps, agents, 3), dtype=np.int32),
-        target_velocity=random.uniform(-0.5, 0.5, (steps, agents, 3)).astype(np.float32),
+        arrow=random.uniform(-0.5, 0.5, (steps, agents, 3)).astype(np.float32),
         present=random.random((steps, agents)) < 0.5,
         flips=[np.sort(random.choice(pairs, int(random.integers(0, pairs)), replace=False)) for _ in range(steps)],
         metrics={name: MetricSeries(name, "m", random.random(steps)) for name in ("error", "cohesion")},
         stride=1,
         comm_range=3.5,
-        max_speed=0.92,
+        max_arrow=0.92,
         frequency=48.0,
     )
     position, velocity, present, metrics, flips = _unpack(html.pack(recording), agents, steps, 2)
     assert np.array_equal(position, recording.position)
-    assert np.abs(velocity * 0.92 / html.VELOCITY_STEPS - recording.target_velocity).max() < 0.0037
+    assert np.abs(velocity * 0.92 / html.ARROW_STEPS - recording.arrow).max() < 0.0037
     assert np.array_equal(present, recording.present)
     assert np.array_equal(metrics, np.stack([series.values for series in recording.metrics.values()]).astype("f4"))
     assert all(np.array_equal(one, other) for one, other in zip(flips, recording.flips, strict=True))

@@ -29,13 +29,14 @@ def _recording(position: Any, present: Any, edges: Any, frames: int) -> Recordin
     quanta, count = quantise(np.asarray(position, float)), len(position)
     return Recording(
         position=np.tile(quanta, (frames, 1, 1)),
-        target_velocity=np.zeros((frames, count, 3)),
+        arrow=np.zeros((frames, count, 3)),
         present=np.tile(np.array(present, bool), (frames, 1)),
         flips=[range_flips(np.array(edges).reshape(-1, 2), quanta, np.array(present, bool), 0.1)] * frames,
         metrics={},
         stride=VIDEO_STRIDE,
         comm_range=0.1,
-        max_speed=1.0,
+        max_arrow=1.0,
+        leader=0,
         frequency=48.0,
     )
 

@@ -146,7 +146,8 @@ class FlockAdapter:
         physics, exists = self.env.physics, self.env.exists[flock].cpu()
         frame = Frame(
             position=physics.position[flock].cpu().double().masked_fill(~exists.unsqueeze(-1), torch.nan).numpy(),
-            target_velocity=as_array(self.env.target_velocity[flock]),
+            arrow=as_array(self.env.target_velocity[flock]),
+            leader=0,
             edges=edge_array(self._adjacency[flock]),
             present=exists.numpy(),
             quaternion=as_array(physics.quaternion[flock]),

@@ -128,9 +128,7 @@ class Renderer:
         edges = np.asarray(frame.position, np.float64)[shortest_edges(frame, MAX_EDGES)]
         drawn: Array = np.asarray(np.isfinite(frame.position).all(-1))
         quaternion = np.tile(LEVEL, (len(drawn), 1)) if frame.quaternion is None else frame.quaternion
-        agents = _Agents(
-            *(np.asarray(part, np.float64)[drawn] for part in (frame.position, quaternion, frame.target_velocity))
-        )
+        agents = _Agents(*(np.asarray(part, np.float64)[drawn] for part in (frame.position, quaternion, frame.arrow)))
         camera = self._camera(agents)
         if self.render_mode == "human":
             self._show(agents, camera, edges)

@@ -19,7 +19,7 @@ def flock(position: list[list[float]], *, speed: float = 0.0, linked: bool = Fal
     count = len(position)
     return Frame(
         position=np.array(position, float).reshape(-1, 3),
-        target_velocity=np.tile([speed, 0.0, 0.0], (count, 1)),
+        arrow=np.tile([speed, 0.0, 0.0], (count, 1)),
         edges=np.argwhere(np.full((count, count), linked) & ~np.eye(count, dtype=bool)),
         present=np.ones(count, bool),
     )
