@@ -329,8 +329,8 @@ class Task:
             return probe(self, env)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is sent to other processes: the settings and the expert; the rest is computed again there."""
-        return {"config": self.config, "_expert": self._expert}
+        """What copies and other processes get: all but what follows from the expert."""
+        return {name: value for name, value in vars(self).items() if name not in ("teacher", "metrics")}
 
 
 def edge_array(adjacency: Tensor) -> np.ndarray[Any, Any]:
