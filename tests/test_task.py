@@ -82,7 +82,7 @@ def test_a_run_is_resumed_evaluated_and_replayed(config):
 def test_without_an_expert_there_is_mappo_alone(config, monkeypatch):
     monkeypatch.setattr(Gather, "expert", lambda self: None)
     for trainer in ("bc", "dagger"):
-        with pytest.raises(InputError, match=f"trainer={trainer} imitates an expert, which task 'gather' does not have"):
+        with pytest.raises(InputError, match=f"trainer={trainer} imitates an expert, which task 'gather' does not"):
             train(config(trainer))
     run = train(config("mappo"))
     rows = json.loads((run.path / "evaluation.json").read_text())["4"]["rows"]

@@ -23,7 +23,7 @@ KINDS = [
 ]
 
 
-def make_env(num_envs: int = 3, num_agents: int = 4, **settings: Any) -> TaskEnv:
+def make_env(num_envs: int = 3, num_agents: int = 4, **settings: Any) -> Any:
     return TaskEnv(Gather(GatherConfig(**settings)), num_envs, num_agents, seed=0)
 
 
@@ -109,7 +109,7 @@ class Broken(Gather):
             raise RuntimeError("no licence")
         if self.defect == "fewer environments":
             num_envs -= 1
-        env = GatherEnv(self.config, num_envs, num_agents + (self.defect == "more agents"), seed, device)
+        env: Any = GatherEnv(self.config, num_envs, num_agents + (self.defect == "more agents"), seed, device)
         if self.defect == "raises in a step":
             env._step = lambda tensordict: 1 / 0
         if self.defect == "other width":
@@ -129,7 +129,7 @@ class Broken(Gather):
         return None if self.defect == "no graph" else super().positions(data)
 
 
-def _use(task: Broken) -> None:
+def _use(task: Any) -> None:
     """One step of the environment, with the expert's labels."""
     env = TaskEnv(task, 2, 4, seed=0)
     env.step(task.teacher(env.reset()).set(ACTION, torch.zeros(2, 4, 2)))
