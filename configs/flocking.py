@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from modgnn_rl.configs.settings import setting
 from modgnn_rl.configs.task import TaskConfig
@@ -20,6 +20,16 @@ class FlockingConfig(TaskConfig):
 
     The defaults are ``env=flocking``, in which the expert keeps flocks together; ``env=paper`` is closest to the paper.
     """
+
+    irrelevant_to_data: ClassVar[tuple[str, ...]] = (
+        "max_steps",
+        "max_links",
+        "compile",
+        "max_distance",
+        "collision_distance",
+        "max_colliding",
+        "on_nonfinite",
+    )
 
     name: str = setting("flocking", "task", choices=TASKS)
     num_agents: Any = setting(
@@ -134,6 +144,13 @@ class FlockingConfig(TaskConfig):
     def reference_size(self) -> int:
         """The number of agents that ``trainer.num_envs`` and ``trainer.agents_per_state`` refer to."""
         return REFERENCE_SIZE
+
+    @property
+    def not_in_data(self) -> list[str]:
+        """Perturbations of adjacency, observation and mask, and edge lists: a dataset holds true states."""
+        names = ("message_loss", "delay", "range_spread", "position_noise", "velocity_noise", "dropout_rate")
+        found = [f"{name}={getattr(self, name)}" for name in names if getattr(self, name)]
+        return [*found, *([] if self.graph == "matrix" else [f"graph={self.graph}"])]
 
     @property
     def hides_state(self) -> bool:

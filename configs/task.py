@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from omegaconf import MISSING
 
@@ -15,7 +15,14 @@ __all__ = ["TaskConfig"]
 
 @dataclass
 class TaskConfig:
-    """Settings that all tasks share; a task derives its own from them, see `modgnn_rl.task.Task`."""
+    """Settings that all tasks share; a task derives its own from them, see `modgnn_rl.task.Task`.
+
+    Attributes:
+        irrelevant_to_data: settings on which neither stored states nor the expert's labels depend, so that a dataset
+            serves for all their values.
+    """
+
+    irrelevant_to_data: ClassVar[tuple[str, ...]] = ("max_steps",)
 
     name: str = setting(MISSING, "task", choices=TASKS)
     num_agents: Any = setting(8, "agents; a list trains on several numbers at once", ge=1, whole=True)
@@ -30,3 +37,8 @@ class TaskConfig:
     def reference_size(self) -> int:
         """The number of agents that ``trainer.num_envs`` and ``trainer.agents_per_state`` refer to."""
         return int(self.sizes[0])
+
+    @property
+    def not_in_data(self) -> list[str]:
+        """Settings, as ``name=value``, whose effect a dataset of states does not contain."""
+        return []

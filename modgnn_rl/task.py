@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -46,6 +46,7 @@ from modgnn_rl.actions import ActionSpace, Ball, Box
 from modgnn_rl.configs.schema import TaskConfig
 from modgnn_rl.errors import InputError
 from modgnn_rl.layout import Layout
+from modgnn_rl.nn.topology import as_matrix
 from modgnn_rl.registry import METRICS, TASKS
 from modgnn_rl.task_env import ACTION, EXPERT_ACTION, OBSERVATION, REWARD, ExpertLabels, Probe, TaskEnv, probe
 from modgnn_rl.visualization.recording import NO_MARKS, Frame
@@ -160,6 +161,33 @@ class Task:
     def training_metrics(self, rollouts: TensorDictBase) -> dict[str, Tensor]:
         """Further metrics of the rollouts [B, T] that a trainer collects, by name, [] each."""
         return {}
+
+    def stored(self, data: TensorDictBase) -> Tensor:
+        """What a dataset keeps of each agent in a step, float32 [*B, N, S].
+
+        Default: observation, the expert's action, whether the policy controls the agent, whether an episode begins, and
+        from whom it receives.
+
+        Args:
+            data: with the expert's action, ``adjacency`` and ``is_init``.
+        """
+        agents = data[OBSERVATION].shape[:-1]
+        flags = [data["agents", "controlled"].unsqueeze(-1), data["is_init"].unsqueeze(-1).expand(*agents, 1)]
+        graph = as_matrix(data["adjacency"], agents[-1])
+        return torch.cat([part.float() for part in (data[OBSERVATION], data[EXPERT_ACTION], *flags, graph)], -1)
+
+    def restored(self, stored: Tensor) -> TensorDict:
+        """The keys of the environment and the expert's actions, from what `stored` kept [*B, N, S]."""
+        widths = [self.layout.width, self.actions.width, 1, 1, stored.shape[-2]]
+        observation, action, controlled, begins, graph = stored.split(widths, -1)
+        agents = {"observation": observation, "expert_action": action, "controlled": controlled.squeeze(-1) > 0}
+        batch = stored.shape[:-2]
+        data = {"agents": TensorDict(agents, batch), "adjacency": graph > 0, "is_init": begins[..., 0, :] > 0}
+        return TensorDict(data, batch, device=stored.device)
+
+    def stored_width(self, num_agents: int) -> int:
+        """Numbers that `stored` keeps of an agent, S."""
+        return self.layout.width + self.actions.width + 2 + num_agents
 
     @functools.cached_property
     def layout(self) -> Layout:

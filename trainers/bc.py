@@ -39,9 +39,7 @@ def check_bc(config: TrainConfig, policies: Sequence[ModGNN], task: Task) -> Non
         check_steps(config, "cloning_steps", parts * window_length(policies, settings))
         return
     if task.has_other_expert:
-        raise InputError(
-            "trainer.dataset holds the labels of Reynolds flocking, not those of your expert; leave one out"
-        )
+        raise InputError("trainer.dataset holds the labels of the task's own expert, not those of yours; leave one out")
     dataset = EpisodeDataset.open(settings.dataset)
     dataset.check_env_config(config.env)
     if dataset.episodes <= settings.num_val_envs:

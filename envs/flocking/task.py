@@ -6,7 +6,7 @@ import dataclasses
 import functools
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -84,6 +84,27 @@ class FlockingTask(Task):
     def positions(self, data: TensorDictBase) -> Tensor:
         """True positions, m [*B, N, 3]."""
         return data[self.config.state_key][..., :3]
+
+    def stored(self, data: TensorDictBase) -> Tensor:
+        """Position, m, and velocity, m/s: graphs and the expert's actions follow from them."""
+        return data["agents", "observation"]
+
+    def restored(self, stored: Tensor) -> TensorDict:
+        """See `Task.restored`."""
+        controlled = torch.ones(stored.shape[:-1], dtype=torch.bool, device=stored.device)
+        controlled[..., 0] = False
+        agents = TensorDict({"observation": stored, "controlled": controlled}, stored.shape[:-2])
+        adjacency = pair_distances(stored[..., :3]) <= self.config.comm_range
+        labelled: TensorDict = self._labels(TensorDict({"agents": agents, "adjacency": adjacency}, stored.shape[:-2]))
+        return labelled
+
+    @functools.cached_property
+    def _labels(self) -> Reynolds:
+        return Reynolds.for_env(dataclasses.replace(self.config, compile=False))
+
+    def stored_width(self, num_agents: int) -> int:
+        """See `Task.stored_width`."""
+        return 6
 
     def training_metrics(self, rollouts: TensorDictBase) -> dict[str, Tensor]:
         """The costs that the reward is made of, unweighted means over the agents that the policy controls."""

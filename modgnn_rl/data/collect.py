@@ -18,14 +18,13 @@ import torch
 from filelock import FileLock, Timeout
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
-from modgnn_rl.configs.schema import CollectConfig, FlockingConfig
+from modgnn_rl.configs.schema import CollectConfig
 from modgnn_rl.configs.settings import check
-from modgnn_rl.data.dataset import IRRELEVANT_SETTINGS
 from modgnn_rl.data.manifest import LOCK, Manifest, check_shard, dataset_env_config, describe_shard, num_bytes
-from modgnn_rl.envs import FlockingEnv
-from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
+from modgnn_rl.task import Task, make_task
 from modgnn_rl.utils.device import prepare_torch
 from modgnn_rl.utils.folders import write_folder
 from modgnn_rl.utils.progress import Progress
@@ -51,8 +50,13 @@ def collect_dataset(config: CollectConfig) -> Path:
     """
     check(config)
     prepare_torch(config.device, config.threads)
+    env_config = dataset_env_config(config.env, config.steps or config.env.max_steps)
+    task = make_task(env_config)
+    if task.teacher is None:
+        raise InputError(f"task '{task.name}' has no expert, whose rollouts could be collected")
     wanted = Manifest(
-        env_config=dataset_env_config(config.env, config.steps or config.env.max_steps),
+        env_config=env_config,
+        width=task.stored_width(env_config.num_agents),
         seed=config.seed,
         num_envs=config.num_envs,
         steps=config.steps or config.env.max_steps,
@@ -65,7 +69,7 @@ def collect_dataset(config: CollectConfig) -> Path:
         missing = {name: shape for name, shape in wanted.shapes.items() if name not in wanted.shards}
         _check_space(folder, sum(map(num_bytes, missing.values())))
         if missing:
-            _collect_shards(folder, wanted, missing)
+            _collect_shards(folder, task, wanted, missing)
     except OSError as error:
         raise InputError(
             f"cannot write into {folder} ({error.strerror}): give output=<a folder that you can write to>"
@@ -116,7 +120,9 @@ def _check_space(folder: Path, size: int) -> None:
         )
 
 
-def _collect_shards(folder: Path, manifest: Manifest, missing: dict[str, tuple[int, int, int, int]]) -> None:
+def _collect_shards(
+    folder: Path, task: Task, manifest: Manifest, missing: dict[str, tuple[int, int, int, int]]
+) -> None:
     """Collect the missing shards (shapes by name), and add each to the manifest once it is on disk."""
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder), Progress("collect", sum(shape[0] * shape[1] for shape in missing.values())) as progress:
@@ -128,9 +134,9 @@ def _collect_shards(folder: Path, manifest: Manifest, missing: dict[str, tuple[i
         try:
             for name, (episodes, steps, agents, _) in missing.items():
                 if env is None or env.batch_size[0] != episodes:
-                    env = FlockingEnv(episodes, agents, config=manifest.env_config, device=manifest.device)
+                    env = task.evaluation_env(episodes, agents, 0, manifest.device, steps=steps)
                 env.set_seed(derive_seed(manifest.seed, name))
-                states = rollout_expert(env, steps, progress)
+                states = rollout_expert(task, env, steps, progress)
                 _check_space(folder, num_bytes(states.shape))
                 _write_shard(folder / name, states)
                 manifest.shards[name] = describe_shard(folder / name)
@@ -161,31 +167,33 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @torch.no_grad()
-def rollout_expert(env: FlockingEnv, steps: int, progress: Progress | None = None) -> Tensor:
-    """Roll out the expert from new initial states; no episode ends early.
+def rollout_expert(task: Task, env: EnvBase, steps: int, progress: Progress | None = None) -> Tensor:
+    """Roll out the expert from new initial states; where the task ends an episode early, the next one begins.
 
     Args:
-        env: B flocks of N agents; their generators determine the episodes.
+        task: says what is stored of a state.
+        env: B environments of N agents; their generators determine the episodes.
         steps: steps T.
         progress: counts flock-steps.
 
     Returns:
-        positions, m, and velocities, m/s, before each step, on the CPU [B, T, N, 6].
+        what `Task.stored` keeps of the state before each step, on the CPU [B, T, N, S].
     """
-    expert = Reynolds.for_env(env.config, action=("agents", "action"))
-    states = torch.empty(env.batch_size[0], steps, env.num_agents, 6, dtype=env.dtype, device=env.device)
-    tensordict = env.reset()
+    expert, states = task.reference_policies()["expert"], []
+    tracked = TransformedEnv(env, InitTracker())
+    tensordict = tracked.reset()
     for step in range(steps):
-        states[:, step] = tensordict["agents", "observation"]
-        # A plain loop: nothing resets the environment, so no episode ends.
-        tensordict = env.step_mdp(env.step(expert(tensordict)))
+        tensordict = expert(tensordict)
+        states.append(task.stored(tensordict).cpu())
+        if step < steps - 1:
+            _, tensordict = tracked.step_and_maybe_reset(tensordict)
         if progress is not None:
-            progress.update(len(states))
-    return states.cpu()
+            progress.update(len(states[0]))
+    return torch.stack(states, 1)
 
 
 def _write_shard(path: Path, states: Tensor) -> None:
-    """Write states [E, T, N, 6] as a memory-mapped TensorDict, atomically."""
+    """Write states [E, T, N, S] as a memory-mapped TensorDict, atomically."""
     with write_folder(path) as temporary:
         TensorDict({"state": states}, states.shape[:2]).memmap(temporary)
 
@@ -194,14 +202,15 @@ def describe_dataset(folder: Path) -> str:
     """Location and size of a dataset, and the command that trains on it."""
     manifest = Manifest.read(folder)
     size = sum(map(num_bytes, manifest.shapes.values()))
-    default = {
-        f"env.{name}": value for name, value in vars(FlockingConfig()).items() if name not in IRRELEVANT_SETTINGS
-    }
+    kind, usual = type(manifest.env_config), CollectConfig().env.name
+    default = {f"env.{name}": value for name, value in vars(kind()).items() if name not in kind.irrelevant_to_data}
     changed = [
         f"{name}={_as_override(manifest.settings[name])}"
         for name in default
-        if manifest.settings[name] != default[name]
+        if name != "env.name" and manifest.settings[name] != default[name]
     ]
+    if manifest.env_config.name != usual:
+        changed.insert(0, f"env={manifest.env_config.name}")
     command = shlex.join(["python", "-m", "modgnn_rl.train", "trainer=bc", f"trainer.dataset={folder}", *changed])
     return (
         f"{manifest.episodes} rollouts of {manifest.steps} steps with {manifest.num_agents} agents are in {folder} "

@@ -4,14 +4,13 @@ Example::
 
     dataset = EpisodeDataset.open("datasets/32-agents")
     buffer = dataset.buffer(length=2, batch_size=256, generator=torch.Generator().manual_seed(0))
-    batch = buffer.sample()  # windows [256, 2] with the keys of FlockingEnv and the expert's actions
+    batch = buffer.sample()  # windows [256, 2] with the keys of the environment and the expert's actions
 
-Only positions and velocities are stored: graphs and the expert's actions are functions of them.
+A task says what is stored of a state, and how graphs and labels follow from it: `modgnn_rl.task.Task.stored`.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from pathlib import Path
@@ -23,24 +22,12 @@ from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 from torchrl.data.replay_buffers import Storage
 
-from modgnn_rl.configs.schema import FlockingConfig, TaskConfig, as_list
+from modgnn_rl.configs.schema import TaskConfig, as_list
 from modgnn_rl.data.manifest import LOCK, MANIFEST, STATE, Manifest, check_shard
-from modgnn_rl.envs.flocking.expert import Reynolds
 from modgnn_rl.errors import InputError
-from modgnn_rl.utils.tensors import pair_distances
+from modgnn_rl.task import Task, make_task
 
-__all__ = ["IRRELEVANT_SETTINGS", "EpisodeDataset", "EpisodeWindows"]
-
-# Settings on which neither episodes, nor dense graphs, nor the expert's actions depend.
-IRRELEVANT_SETTINGS = (
-    "max_steps",
-    "max_links",
-    "compile",
-    "max_distance",
-    "collision_distance",
-    "max_colliding",
-    "on_nonfinite",
-)
+__all__ = ["EpisodeDataset", "EpisodeWindows"]
 
 
 class EpisodeDataset:
@@ -53,17 +40,18 @@ class EpisodeDataset:
         episodes: number of episodes, E.
         steps: steps per episode, T.
         num_agents: agents in a flock, N.
-        shards: the episodes, memory-mapped TensorDicts [E_k, T] that hold "state" [E_k, T, N, 6]: positions, m, and
-            velocities, m/s. Changes to them stay in this process.
+        shards: the episodes, memory-mapped TensorDicts [E_k, T] that hold "state" [E_k, T, N, S]. Changes to them stay
+            in this process.
+        task: of the episodes.
         device: device of the tensors that `windows` returns.
     """
 
     def __init__(self, path: Path, manifest: Manifest, shards: list[TensorDict], device: torch.device | str) -> None:
         self.path, self.manifest, self.shards = path, manifest, shards
-        self.env_config: FlockingConfig = manifest.env_config
+        self.env_config: Any = manifest.env_config
         self.episodes, self.steps, self.num_agents = manifest.episodes, manifest.steps, manifest.num_agents
         self.device = torch.device(device)
-        self._expert = Reynolds.for_env(dataclasses.replace(self.env_config, compile=False))
+        self.task: Task = make_task(self.env_config)
 
     @classmethod
     def open(
@@ -108,7 +96,7 @@ class EpisodeDataset:
         Raises:
             InputError: the settings that differ.
         """
-        wanted = {name: value for name, value in vars(env_config).items() if name not in IRRELEVANT_SETTINGS}
+        wanted = {name: value for name, value in vars(env_config).items() if name not in env_config.irrelevant_to_data}
         size = as_list(wanted["num_agents"])
         wanted["num_agents"] = size[0] if len(size) == 1 else size
         different = self.manifest.differences({f"env.{name}": value for name, value in wanted.items()})
@@ -123,7 +111,7 @@ class EpisodeDataset:
         return self.episodes * self.steps
 
     def states(self, index: Tensor, length: int) -> Tensor:
-        """Positions and velocities of the ``length`` steps up to each index, on the CPU.
+        """What is stored of the ``length`` steps up to each index, on the CPU.
 
         Steps before the start of an episode repeat its first state.
 
@@ -132,7 +120,7 @@ class EpisodeDataset:
             length: steps W of each window.
 
         Returns:
-            states [S, W, N, 6].
+            states, as the task stores them [S, W, N, ...].
 
         Raises:
             InputError: an index is out of range, or the length is below 1.
@@ -146,14 +134,14 @@ class EpisodeDataset:
             )
         episode, step = index // self.steps, self._steps(index, length).clamp(min=0)
         shard, row = episode // self.manifest.num_envs, (episode % self.manifest.num_envs).unsqueeze(-1)
-        states = torch.empty(*step.shape, self.num_agents, 6)
+        states = torch.empty(*step.shape, self.num_agents, self.manifest.width)
         for number in shard.unique().tolist():
             chosen = shard == number
             states[chosen] = self.shards[number]["state"][row[chosen], step[chosen]]
         return states
 
     def windows(self, index: Tensor, length: int) -> TensorDict:
-        """Windows of episodes with the keys of `FlockingEnv` and the expert's actions.
+        """Windows of episodes with the keys of the environment and the expert's actions.
 
         A window that starts before its episode repeats the first state with ``is_init`` set, so that a policy has no
         messages there; a window of ``policy.window`` steps gives exact actions at its end.
@@ -163,17 +151,12 @@ class EpisodeDataset:
             length: steps W of each window.
 
         Returns:
-            [S, W], with ``("agents", "observation")`` [S, W, N, 6], ``("agents", "controlled")`` [S, W, N],
-            ``("agents", "expert_action")`` [S, W, N, 3], ``adjacency`` [S, W, N, N] and ``is_init`` [S, W, 1].
+            [S, W], with ``("agents", "observation")`` [S, W, N, F], ``("agents", "controlled")`` [S, W, N],
+            ``("agents", "expert_action")`` [S, W, N, A], ``adjacency`` [S, W, N, N] and ``is_init`` [S, W, 1].
         """
-        states = self.states(index, length).to(self.device)
+        windows = self.task.restored(self.states(index, length).to(self.device))
         is_init = (self._steps(index, length) <= 0).unsqueeze(-1).to(self.device)
-        controlled = torch.ones(states.shape[:-1], dtype=torch.bool, device=self.device)
-        controlled[..., 0] = False
-        agents = TensorDict({"observation": states, "controlled": controlled}, states.shape[:2])
-        adjacency = pair_distances(states[..., :3]) <= self.env_config.comm_range
-        windows = TensorDict({"agents": agents, "adjacency": adjacency, "is_init": is_init}, states.shape[:2])
-        return self._expert(windows)
+        return windows.set("is_init", is_init | windows["is_init"] if "is_init" in windows else is_init)
 
     def _steps(self, index: Tensor, length: int) -> Tensor:
         """Time steps of windows, [S, W]; negative before the start of the episode."""

@@ -5,7 +5,8 @@ One dataset is a folder::
     manifest.json       settings, versions of packages, SHA-256 and size of each file below, and of itself
     shard_00000/        the first num_envs episodes, as tensordict writes a memory-mapped TensorDict
       meta.json
-      state.memmap      positions, m, and velocities, m/s: float32 [episodes, steps, N, 6]
+      state.memmap      what the task stores of each agent: float32 [episodes, steps, N, S]; of flocking, position,
+                        m, and velocity, m/s
     shard_00001/
       ...
 """
@@ -23,9 +24,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from modgnn_rl.configs.schema import FlockingConfig, TaskConfig
+from modgnn_rl.configs.schema import TaskConfig
 from modgnn_rl.configs.settings import check
 from modgnn_rl.errors import InputError
+from modgnn_rl.registry import TASKS
 from modgnn_rl.utils.files import write_atomically
 from modgnn_rl.utils.folders import describe_files, verify_files
 
@@ -42,14 +44,12 @@ __all__ = [
     "num_bytes",
 ]
 
-DATASET_VERSION = 2  # 1: the environment's settings were under the key "world"
+DATASET_VERSION = 3  # 1: the environment's settings were under the key "world"; 2: they did not name the task
 MANIFEST = "manifest.json"
 STATE = "state.memmap"
 LOCK = ".lock"
 FILES = ("meta.json", STATE)  # of a shard
 PACKAGES = ("modgnn_rl", "torch", "torchrl", "tensordict")
-# Perturbations that affect only adjacency, observation and mask, which a dataset does not contain.
-UNSEEN = ("message_loss", "delay", "range_spread", "position_noise", "velocity_noise", "dropout_rate")
 
 _DERIVED = ("schema_version", "complete", "num_agents")  # in the file for its readers
 
@@ -62,6 +62,7 @@ class Manifest:
 
     Attributes:
         env_config: env config of the episodes.
+        width: numbers stored of an agent in a step, S.
         seed: each shard was collected with the seed ``derive_seed(seed, name)``.
         num_envs: episodes in each shard but the last, collected in parallel.
         steps: steps of an episode, T.
@@ -70,7 +71,8 @@ class Manifest:
         shards: by name of each finished shard, size and SHA-256 of its files, and versions of packages.
     """
 
-    env_config: FlockingConfig
+    env_config: TaskConfig
+    width: int
     seed: int
     num_envs: int
     steps: int
@@ -102,7 +104,7 @@ class Manifest:
         """The shape of the states of each shard of the complete dataset, by its name, in order."""
         starts = range(0, self.episodes, self.num_envs)
         return {
-            f"shard_{number:05d}": (min(self.num_envs, self.episodes - start), self.steps, self.num_agents, 6)
+            f"shard_{number:05d}": (min(self.num_envs, self.episodes - start), self.steps, self.num_agents, self.width)
             for number, start in enumerate(starts)
         }
 
@@ -148,9 +150,10 @@ class Manifest:
         env_config = {
             name: float(value) if value in ("inf", "-inf") else value for name, value in known["env_config"].items()
         }
-        manifest = cls(**{**known, "env_config": FlockingConfig(**env_config)})
+        settings = TASKS[env_config["name"]].option("settings", TaskConfig)
+        manifest = cls(**{**known, "env_config": settings(**env_config)})
         check(manifest.env_config, "env_config")
-        for name in ("num_envs", "steps", "episodes", "num_agents"):
+        for name in ("num_envs", "steps", "episodes", "num_agents", "width"):
             if type(count := getattr(manifest, name)) is not int or count < 1:
                 raise ValueError(f"{name} is {count}")
         return manifest
@@ -215,25 +218,19 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def dataset_env_config(env_config: TaskConfig, steps: int) -> FlockingConfig:
+def dataset_env_config(env_config: TaskConfig, steps: int) -> Any:
     """The env config of a dataset of episodes with a number of steps.
 
     Raises:
-        InputError: the state of this environment is more than positions and velocities.
+        InputError: states do not determine what agents observe, or there are several numbers of agents.
     """
-    if not isinstance(env_config, FlockingConfig):
-        raise InputError(f"env={env_config.name} has no datasets yet; train with trainer=dagger")
     if len(env_config.sizes) > 1:
         raise InputError(
             f"env.num_agents={env_config.sizes} names several sizes; a dataset has one: collect one for each"
         )
-    hidden = [f"env.{name}={getattr(env_config, name)}" for name in UNSEEN if getattr(env_config, name)]
-    if env_config.graph != "matrix":
-        hidden.append(f"env.graph={env_config.graph}")
-    if hidden:
+    if hidden := env_config.not_in_data:
         raise InputError(
-            f"a dataset contains positions and velocities, which do not determine the observations with "
-            f"{', '.join(hidden)}; "
+            f"a dataset contains states, which do not determine the observations with env.{', env.'.join(hidden)}; "
             "leave it out, or train with trainer=dagger, which collects its own rollouts"
         )
     return dataclasses.replace(env_config, num_agents=env_config.sizes[0], max_steps=steps)

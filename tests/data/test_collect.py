@@ -23,6 +23,7 @@ from modgnn_rl.data.collect import collect_dataset, describe_dataset, rollout_ex
 from modgnn_rl.data.dataset import EpisodeDataset
 from modgnn_rl.data.manifest import LOCK, MANIFEST, STATE, Manifest
 from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.envs.flocking.task import FlockingTask
 from modgnn_rl.errors import InputError
 from modgnn_rl.utils import folders
 
@@ -107,10 +108,10 @@ def test_ctrl_c_says_how_far_it_got(
 ) -> None:
     real = rollout_expert
 
-    def interrupted(env: FlockingEnv, *arguments: Any) -> Any:
+    def interrupted(task: FlockingTask, env: FlockingEnv, *arguments: Any) -> Any:
         if env.batch_size[0] == 1:
             raise KeyboardInterrupt
-        return real(env, *arguments)
+        return real(task, env, *arguments)
 
     monkeypatch.setattr(collect_module, "rollout_expert", interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -211,8 +212,10 @@ def test_rollouts_do_not_depend_on_those_before(tmp_path: Path, env_config: dict
 
 def test_nothing_ends_a_rollout() -> None:
     env_config = FlockingConfig(num_agents=5, max_steps=3, max_distance=0.1, max_colliding=0.01, collision_distance=9.0)
-    states = rollout_expert(FlockingEnv(3, config=env_config, seed=0), 12)
-    plain = rollout_expert(FlockingEnv(3, config=FlockingConfig(num_agents=5), seed=0), 12)
+    states, plain = (
+        rollout_expert(task, task.evaluation_env(3, 5, 0, "cpu", steps=12), 12)
+        for task in (FlockingTask(env_config), FlockingTask(FlockingConfig(num_agents=5)))
+    )
     assert torch.equal(states, plain)
     assert not states[:, 0, :, 3:].any()
     assert states[:, 1:, 1:, 3:].any(-1).all()

@@ -198,7 +198,7 @@ def _edit(**changes: Any) -> Callable[[Path], None]:
         (lambda path: (path / MANIFEST).write_text("[" * 100_000), "manifest.json is damaged"),
         (lambda path: (path / MANIFEST).write_text("null"), "manifest.json is damaged"),
         (lambda path: (path / MANIFEST).write_bytes(b"\xff\xfe"), "manifest.json is damaged"),
-        (_edit(schema_version=1), "has schema version 1, this program reads 2"),
+        (_edit(schema_version=1), "has schema version 1, this program reads 3"),
         (_edit(steps=1), "manifest.json is damaged .*changed since it was written"),
         (_plant("other.pickle"), "other.pickle does not belong to the dataset"),
         (_plant("shard_00003"), "shard_00003 does not belong to the dataset"),
