@@ -81,7 +81,7 @@ class EvaluationConfig:
     num_agents: Any = setting(None, "agents in a flock, or a list of sizes; null: as in training", ge=1, whole=True)
     steps: int | None = setting(None, "steps per episode; null: env.max_steps", ge=4)
     seed: int = setting(
-        1_000_000, "random seed of initial states and leaders, independent of those of training", ge=0, le=2**32
+        1_000_000, "random seed of the initial states, independent of those of training", ge=0, le=2**32
     )
 
 
@@ -189,7 +189,7 @@ class ReplayConfig:
     stride: int | None = setting(
         None, "keep every n-th step for the replay; null: every step, unless agents x steps is very large", ge=1
     )
-    seed: int = setting(1_000_000, "random seed of the initial state and the leader", ge=0, le=2**32)
+    seed: int = setting(1_000_000, "random seed of the initial state", ge=0, le=2**32)
     format: str = setting(
         "html",
         "output: a web page that plays the rollout, a video, or an image of one step",

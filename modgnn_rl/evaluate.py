@@ -12,7 +12,7 @@ from modgnn_rl.tracking.run_folder import RunFolder
 
 
 def main(config: EvaluateConfig) -> None:
-    """Evaluate a policy against the expert and a zero-action baseline.
+    """Evaluate a policy beside the expert and the other reference policies of its task.
 
     Examples::
 

@@ -49,6 +49,8 @@ INPUT_ERROR = 2
 INTERRUPTED = 130
 PIPE_CLOSED = 141  # as shells report a program ended by SIGPIPE
 
+# Settings of what Hydra writes.
+WITHOUT_EFFECT = ("hydra.run.", "hydra.sweep.", "hydra.output_subdir", "hydra.job.chdir")
 # What Hydra raises for a command line or a YAML file that the user can fix, as long as no job has started.
 USER_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, UserWarning, ValueError)
 
@@ -85,7 +87,7 @@ def run_command(
     with tempfile.TemporaryDirectory(prefix="modgnn_rl-") as scratch, _exit_codes(command, jobs):
         typed = [os.environ.get("COMP_LINE", "")] if flags.shell_completion else flags.overrides
         own_files = flags.config_dir or any(argument.startswith("hydra.searchpath") for argument in typed)
-        register(command, typed, load_all=bool(own_files), scratch=scratch)
+        register(command, typed, load_all=bool(own_files), scratch=scratch, config_dir=flags.config_dir)
         if flags.shell_completion:
             answer_tab(functools.partial(compose, command, jobs.run), flags.overrides, schema)
         else:
@@ -199,6 +201,11 @@ def _parse_flags(arguments: Sequence[str]) -> argparse.Namespace:
         reason = output.getvalue().rpartition("error: ")[2].strip()
         print_error(f"{reason}; flags come before or after all settings, and --help lists them")
         sys.exit(INPUT_ERROR)
+    for override in flags.overrides:
+        if override.lstrip("+~").startswith(WITHOUT_EFFECT):
+            name = override.partition("=")[0]
+            print_error(f"{name} has no effect, since Hydra writes nothing here; runs= and name= say where a run goes")
+            sys.exit(INPUT_ERROR)
     if flags.multirun and "TORCHELASTIC_RUN_ID" in os.environ:
         print_error("--multirun cannot be combined with torchrun: call torchrun once for each run")
         sys.exit(INPUT_ERROR)

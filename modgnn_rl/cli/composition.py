@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import typing
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import hydra
+import yaml
 from hydra.conf import HelpConf, HydraConf, JobConf, RunDir, SweepDir
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
@@ -51,13 +54,16 @@ class Command(NamedTuple):
     config_path: str
 
 
-def register(command: Command, arguments: Sequence[str], *, load_all: bool, scratch: str) -> None:
+def register(
+    command: Command, arguments: Sequence[str], *, load_all: bool, scratch: str, config_dir: str | None = None
+) -> None:
     """Give Hydra the command's dataclasses, its registered choices, its help, and defaults that write nothing.
 
     Args:
         command: the command.
         arguments: command line; a choice whose settings are slow to import is imported if an argument mentions it.
         load_all: import all of them, since YAML files of the user may mention them.
+        config_dir: folder with YAML files of the user, which may begin with a choice ``<module>:<name>``.
         scratch: folder for the file that Hydra writes in a multirun whatever its settings say.
 
     Raises:
@@ -70,7 +76,7 @@ def register(command: Command, arguments: Sequence[str], *, load_all: bool, scra
     store.store(name=f"{command.name}_schema", node=command.schema(**bases))
     for field in grouped:
         store.repo.pop(field.name, None)  # choices of a command that ran before in this process
-        for choice in (*field.metadata["registry"], *_references(field.name, arguments)):
+        for choice in (*field.metadata["registry"], *_references(field.name, arguments, config_dir)):
             load = load_all or any(choice in argument for argument in arguments)
             store.store(group=field.name, name=choice, node=choice_settings(field, choice, load=load))
     quiet = {"hydra_logging": "none", "job_logging": "none"}
@@ -91,10 +97,13 @@ def register(command: Command, arguments: Sequence[str], *, load_all: bool, scra
     OmegaConf.register_new_resolver("modgnn_rl_help", show_help, replace=True)
 
 
-def _references(group: str, arguments: Sequence[str]) -> list[str]:
-    """The choices of a group on a command line that name an object in a module, ``<module>:<name>``."""
-    given = (argument.partition("=")[2] for argument in arguments if argument.startswith(f"{group}="))
-    return [choice for value in given for choice in value.split(",") if ":" in choice]
+def _references(group: str, arguments: Sequence[str], config_dir: str | None) -> list[str]:
+    """The choices of a group that name an object in a module, ``<module>:<name>``, typed or in files of the user."""
+    given = [argument.partition("=")[2] for argument in arguments if argument.startswith(f"{group}=")]
+    for file in Path(config_dir, group).glob("*.yaml") if config_dir else ():
+        with contextlib.suppress(OSError, yaml.YAMLError, AttributeError):  # Hydra reports them
+            given += map(str, yaml.safe_load(file.read_text(encoding="utf-8")).get("defaults", []))
+    return [choice for value in given for choice in value.split(",") if ":" in choice and "{" not in choice]
 
 
 def choice_settings(field: dataclasses.Field[Any], choice: str, *, load: bool) -> Any:

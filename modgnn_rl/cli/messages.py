@@ -46,7 +46,14 @@ def explain(error: BaseException, known: Sequence[str]) -> str:
     cause = error if isinstance(error, OmegaConfBaseException) else error.__cause__ or error.__context__
     if not isinstance(cause, OmegaConfBaseException):
         return str(error) or type(error).__name__
-    file = re.match(r"In '[^']*': ", str(error))
+    file = re.match(r"In '([^']*)': ", str(error))
+    key = cause.full_key or str(cause.key)
+    if file and isinstance(cause, ConfigKeyError) and key in known:
+        group = key.partition(".")[0]
+        return (
+            f"{file[1]}.yaml has settings of {group} but does not say of which: begin it with the lines "
+            f"'defaults:', '  - flocking' or another choice of {group}=, and '  - _self_'"
+        )
     return (file[0] if file else "") + _explain_value(cause, known)
 
 
@@ -58,4 +65,6 @@ def _explain_value(error: OmegaConfBaseException, known: Sequence[str]) -> str:
     if isinstance(error, MissingMandatoryValue):
         return f"{key} must be given, as in {key}=..."
     reason = str(error.msg or error).splitlines()[0]
+    if "does not support deletion" in reason:
+        return f"{key} cannot be removed"
     return f"{key}: {reason}" if error.full_key else reason
