@@ -86,7 +86,9 @@ class Ball(ActionSpace):
 
 
 class Box(ActionSpace):
-    """Numbers between bounds: outputs are squashed into them by tanh; an unbounded component stays as it is.
+    """Numbers between bounds: outputs are clipped to them, but have the gradient of the output itself.
+
+    So a policy whose outputs lie beyond the bounds can learn to return; tanh would leave it without gradient.
 
     Args:
         low: lower bounds [A].
@@ -107,11 +109,9 @@ class Box(ActionSpace):
         return self.width == dims and "rotation" not in symmetries and bool((self.low == -self.high).all())
 
     def forward(self, output: Tensor) -> Tensor:
-        """Squash each component into its bounds."""
-        bounded = (self.low.isfinite() & self.high.isfinite()).to(output.device)
-        half = torch.where(bounded, (self.high - self.low) / 2, 1.0).to(output)
-        middle = torch.where(bounded, (self.high + self.low) / 2, 0.0).to(output)
-        return torch.where(bounded, middle + half * torch.tanh((output - middle) / half), output)
+        """Clip each component to its bounds."""
+        clipped = output.clamp(self.low.to(output), self.high.to(output))
+        return output + (clipped - output).detach() if output.requires_grad else clipped
 
     def idle(self, like: Tensor) -> Tensor:
         """Zeros, or the nearest legal action [..., A]."""

@@ -62,9 +62,12 @@ def test_the_highest_score_is_the_move(actions: str) -> None:
 def test_a_box_has_the_bounds_of_the_spec() -> None:
     actions = make_task(GatherConfig()).actions
     assert isinstance(actions, Box)
-    output = torch.tensor([[100.0, -100.0], [0.0, 0.3]])
-    assert actions(output)[0].tolist() == [1.0, -1.0]
-    assert actions(output)[1, 1].item() == pytest.approx(0.2913, abs=1e-4)  # tanh
+    output = torch.tensor([[100.0, -100.0], [0.0, 0.3]], requires_grad=True)
+    action = actions(output)
+    assert action.flatten().tolist() == pytest.approx([1.0, -1.0, 0.0, 0.3])
+    action.sum().backward()
+    assert output.grad is not None
+    assert output.grad.flatten().tolist() == [1.0] * 4  # a policy can return from beyond the bounds
     assert not list(actions.parameters())
     assert not actions.state_dict()
 

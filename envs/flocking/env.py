@@ -309,12 +309,16 @@ class FlockingEnv(EnvBase):
         self._adjacency_matrix, self._step_outcome = compiled(adjacency_matrix), compiled(step_outcome)
         return self
 
-    def to(self, device: torch.device | str) -> FlockingEnv:
+    def to(self, device: torch.device | str | torch.dtype) -> FlockingEnv:
         """Return the environment itself if it is on ``device`` already; its state cannot be moved.
 
         Raises:
             InputError: for another device.
         """
+        if isinstance(device, torch.dtype):
+            raise InputError(
+                f"this environment computes in {self.dtype}; create it with dtype={device} for another type"
+            )
         wanted = torch.device(device)
         if wanted.type != self.device.type or wanted.index not in (None, self.device.index):
             raise InputError(

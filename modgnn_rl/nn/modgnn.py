@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Self, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
@@ -83,6 +83,11 @@ class ModGNN(TensorDictModuleBase):
         form: str = "auto",
     ) -> None:
         super().__init__()
+        if isinstance(observation, list) or isinstance(action, list):
+            raise InputError(
+                f"observation={observation} and action={action} must be one key each: a policy acts for one group of "
+                "agents; put all agents into one group, or build one policy for each"
+            )
         if form not in FORMS:
             raise InputError(f"form={form!r} is not one of {', '.join(FORMS)}")
         modules = nn.ModuleList(layers if isinstance(layers, Sequence) else [layers])
@@ -184,6 +189,11 @@ class ModGNN(TensorDictModuleBase):
         Raises:
             InputError: an entry is missing, or its shape does not match the observations.
         """
+        if not is_tensor_collection(tensordict):
+            raise InputError(
+                f"the policy reads a TensorDict with '{dotted(self._keys[0])}' and '{dotted(self._keys[1])}', and was "
+                f"given a {type(tensordict).__name__}: pass TensorDict({{...}}, batch_size)"
+            )
         data = self._read(tensordict, receivers)
         if recurrent_mode():
             needed = None if receivers is None else self._needed_outputs(receivers)

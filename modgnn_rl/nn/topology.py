@@ -66,6 +66,8 @@ class Topology:
         feature: Tensor | None = None,
         form: str = "auto",
     ) -> None:
+        if adjacency.layout != torch.strided:
+            adjacency = adjacency.to_dense()
         self.num_agents = num_agents
         self.is_edge_list = adjacency.dtype == torch.int64
         _check_shape(adjacency, num_agents, is_edge_list=self.is_edge_list)

@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
-from modgnn_rl import ModGNN, ModGNNLayer
+from modgnn_rl import InputError, ModGNN, ModGNNLayer, make_model
 from tests.nn.helpers import dense
 
 FEATURES, WIDTH = 3, 4
@@ -347,3 +347,22 @@ def test_a_layer_that_sends_nothing_does_not_widen_the_messages() -> None:
     assert run_window(policy, random_data(2, 3, agents=3).exclude("is_init"))[1].shape[-1] == 4 * FEATURES
     last = ModGNN([bare_layer(1), ModGNNLayer(0)])
     assert run_window(last, random_data(2, 3, agents=3))[1].shape[-2:] == (1, FEATURES)
+
+
+def test_a_sparse_graph_is_read_like_a_dense_one() -> None:
+    policy = make_model("modgnn_mlp", seed=0)
+    observation = torch.randn(2, 5, 6, generator=torch.Generator().manual_seed(0))
+    adjacency = torch.rand(2, 5, 5, generator=torch.Generator().manual_seed(1)) < 0.5
+    actions = []
+    for graph in (adjacency, adjacency.to_sparse()):
+        data = TensorDict({"agents": {"observation": observation}, "is_init": torch.ones(2, 1, dtype=torch.bool)}, [2])
+        actions.append(policy(data.set("adjacency", graph))["agents", "action"])
+    assert torch.equal(*actions)
+
+
+def test_tensors_and_lists_of_keys_are_refused_in_one_sentence() -> None:
+    policy = make_model("gcn", seed=0)
+    with pytest.raises(InputError, match="the policy reads a TensorDict with"):
+        policy(torch.zeros(2, 5, 6), torch.zeros(2, 5, 5))
+    with pytest.raises(InputError, match="must be one key each"):
+        make_model("gcn", observation=[("a", "observation"), ("b", "observation")])

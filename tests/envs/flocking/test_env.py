@@ -625,6 +625,8 @@ def test_the_environment_cannot_be_moved() -> None:
     assert env.to("cpu") is env
     with pytest.raises(InputError, match="create it with device='meta'"):
         env.to("meta")
+    with pytest.raises(InputError, match=r"create it with dtype=torch.float64"):
+        env.to(torch.float64)
 
 
 def test_a_device_without_index_is_the_current_one(monkeypatch: pytest.MonkeyPatch) -> None:
