@@ -3,7 +3,8 @@
     pip install 'modgnn-rl[vmas]'
     python -m modgnn_rl.train env=vmas env.scenario=transport trainer=dagger
 
-Robots hear each other within ``env.comm_range``. Scenarios whose agents are all of one kind are supported.
+Robots hear each other within ``env.comm_range``. Scenarios whose agents are all of one kind are supported. VMAS is
+under the GPL, and not a dependency of this library.
 """
 
 from __future__ import annotations
@@ -11,35 +12,36 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.util
-import pkgutil
+import inspect
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase, MarlGroupMapType, Transform, TransformedEnv, VmasEnv
+from torchrl.envs import VmasEnv
 
 from modgnn_rl.configs.schema import TaskConfig
 from modgnn_rl.configs.settings import setting
+from modgnn_rl.envs.vmas_env import POSITION, ScenarioEnv
 from modgnn_rl.errors import InputError, one_line, suggestion
+from modgnn_rl.layout import Layout
 from modgnn_rl.registry import TASKS
 from modgnn_rl.task import EXPERT_ACTION, OBSERVATION, Task
-from modgnn_rl.utils.seeds import seeded
 
-__all__ = ["Vmas", "VmasConfig", "scenarios"]
+__all__ = ["Vmas", "VmasConfig", "keep_right", "scenarios"]
 
-SOLVED = (
-    "discovery",
-    "give_way",
-    "multi_give_way",
-    "navigation",
-    "reverse_transport",
+# Scenarios whose episodes end when they are solved; of balance also when the package falls.
+SOLVABLE = {
+    *("balance", "discovery", "dispersion", "give_way", "multi_give_way", "navigation", "reverse_transport"),
     "transport",
-)  # done means solved
+}
+# Scenarios in which only positions relative to what a robot observes matter.
+TRANSLATIONS = {"navigation"}
 
 
 @dataclass
@@ -51,12 +53,12 @@ class VmasConfig(TaskConfig):
     num_agents: Any = setting(4, "robots; a list trains on several numbers at once", ge=1, whole=True)
     comm_range: float = setting(1.0, "distance within which robots hear each other (m)", gt=0)
     discrete: bool = setting(False, "whether robots choose among the scenario's discrete actions")
-    options: dict[str, Any] = setting({}, "settings of the scenario, as in env.options={n_packages: 2}")
+    options: dict[str, Any] = setting({}, "settings of the scenario, as in 'env.options={n_packages: 2}'")
 
 
 @TASKS.register("vmas", settings=VmasConfig)
 class Vmas(Task):
-    """A scenario of VMAS, with VMAS' own heuristic as the expert where it has one."""
+    """Scenarios of VMAS; its heuristic policies are the experts."""
 
     config: VmasConfig
 
@@ -68,79 +70,82 @@ class Vmas(Task):
                 f"{suggestion(config.scenario, scenarios())}"
             )
 
-    def make_env(self, num_envs: int, num_agents: int, seed: int, device: torch.device | str) -> EnvBase:
-        """See `Task.make_env`; the robots' positions are under ``("agents", "position")``."""
-        with seeded(seed):  # VMAS draws from torch's global generator
-            env = VmasEnv(
-                self.config.scenario,
-                num_envs=num_envs,
-                continuous_actions=not self.config.discrete,
-                device=device,
-                seed=seed,
-                group_map=MarlGroupMapType.ALL_IN_ONE_GROUP,
-                n_agents=num_agents,
-                **self.config.options,
-            )
-        if env.het_specs:
-            raise InputError(
-                f"env.scenario={self.config.scenario} has agents of different kinds, and one policy acts for all; use "
-                "a scenario whose agents have equal observations and actions"
-            )
-        return TransformedEnv(env, _Places(has_landmarks=bool(env.world.landmarks)))
+    def make_env(self, num_envs: int, num_agents: int, seed: int, device: torch.device | str) -> ScenarioEnv:
+        """See `Task.make_env`.
 
-    def expert(self) -> TensorDictModuleBase | None:
-        """VMAS' heuristic, if there is one; of navigation a rule of ours."""
-        rule = _heuristic(self.config.scenario, discrete=self.config.discrete)
-        return None if rule is None else TensorDictModule(rule, [OBSERVATION], [EXPERT_ACTION])
+        Raises:
+            InputError: the scenario has another number of agents, agents of different kinds, or other options.
+        """
+        takes_number = '"n_agents"' in inspect.getsource(_module_of(self.config.scenario))
+        options = ({"n_agents": num_agents} if takes_number else {}) | self.config.options
+        where: dict[str, Any] = {"seed": seed, "device": device, "discrete": self.config.discrete}
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message="Scenario kwargs")  # that it does not know
+            try:
+                env = ScenarioEnv(self.config.scenario, num_envs, options=options, **where)
+            except UserWarning as warning:
+                raise InputError(f"env.options do not fit scenario '{self.config.scenario}': {warning}") from warning
+        if env.n_agents != num_agents:
+            raise InputError(
+                f"scenario '{self.config.scenario}' has {env.n_agents} agents with these options; "
+                f"set env.num_agents={env.n_agents}"
+            )
+        return env
+
+    @functools.cached_property
+    def _sample(self) -> ScenarioEnv:
+        """A small environment, to look things up."""
+        return self.make_env(4, self.sizes[0], 0, torch.device("cpu"))
+
+    @property
+    def frequency(self) -> float:  # type: ignore[override]
+        """Steps a second, Hz."""
+        return 1 / float(self._sample.world.dt)
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Position and velocity first, where the scenario's observation begins with them."""
+        env = self._sample
+        env.reset()
+        step = env.rand_step()["next", "agents"]
+        width = step["observation"].shape[-1]
+        velocity = torch.stack([agent.state.vel for agent in env.agents], 1)
+        state = torch.cat((step["position"], velocity), -1)
+        if width < 4 or not torch.equal(step["observation"][..., :4], state):
+            return Layout(width)
+        symmetries = ("translation",) if self.config.scenario in TRANSLATIONS else ()
+        return Layout(width, dims=2, vectors=2, symmetries=symmetries)
+
+    def expert(self) -> TensorDictModule | None:
+        """VMAS' heuristic for the scenario, of navigation `keep_right`; None: there is none for these actions."""
+        scenario, discrete, env = self.config.scenario, self.config.discrete, self._sample
+        limit = float(env.agents[0].action.u_range)
+        act: Callable[[Tensor], Tensor] | None
+        if scenario == "navigation":
+            act = None if discrete else functools.partial(keep_right, limit=limit)
+        else:
+            act = _heuristic(scenario, env.reset()[OBSERVATION], limit, discrete=discrete)
+        return None if act is None else TensorDictModule(act, in_keys=[OBSERVATION], out_keys=[EXPERT_ACTION])
 
     def positions(self, data: TensorDictBase) -> Tensor:
-        """See `Task.positions`."""
-        return data["agents", "position"]
+        """Positions, m [*B, N, 2]."""
+        return data[POSITION]
 
     def targets(self, data: TensorDictBase) -> Tensor | None:
-        """Goals and landmarks of the scenario."""
-        return data.get("landmarks", None)
+        """Goals, targets and packages, m [*B, M, 2]."""
+        landmarks = data.get("landmarks", None)
+        return landmarks if landmarks is not None and landmarks.shape[-2] else None
 
     @property
     def has_success(self) -> bool:
-        """Whether the scenario ends when it is solved."""
-        return self.config.scenario in SOLVED
+        """Whether episodes of the scenario end when it is solved."""
+        return self.config.scenario in SOLVABLE
 
     def success(self, data: TensorDictBase) -> Tensor:
-        """Whether the scenario has ended."""
-        return data["terminated"].squeeze(-1)
+        """Whether the episode has ended with the task solved, bool [*B]."""
+        return data["success"].squeeze(-1)
 
 
-class _Places(Transform):
-    """Adds the positions of robots and landmarks, which VMAS' observations need not contain."""
-
-    def __init__(self, *, has_landmarks: bool) -> None:
-        super().__init__(in_keys=[], out_keys=[("agents", "position"), *(["landmarks"] if has_landmarks else [])])
-
-    def _places(self) -> dict[Any, Tensor]:
-        world = self.parent.base_env.world
-        entities = (world.policy_agents, world.landmarks)
-        return {
-            key: torch.stack([entity.state.pos for entity in kind], -2)
-            for key, kind in zip(self.out_keys, entities, strict=False)
-        }
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for key, value in self._places().items():
-            next_tensordict.set(key, value)
-        return next_tensordict
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the positions to the spec."""
-        for key, value in self._places().items():
-            observation_spec[key] = Unbounded(value.shape, device=value.device, dtype=value.dtype)
-        return observation_spec
-
-
-@functools.cache
 def scenarios() -> list[str]:
     """Names of the scenarios of VMAS.
 
@@ -149,50 +154,54 @@ def scenarios() -> list[str]:
     """
     if importlib.util.find_spec("vmas") is None:
         raise InputError("env=vmas needs VMAS, which is not installed: pip install 'modgnn-rl[vmas]'")
-    folders = importlib.import_module("vmas.scenarios").__path__
-    return sorted(module.name for module in pkgutil.iter_modules(folders) if not module.ispkg)
+    return sorted(VmasEnv.available_envs)
 
 
-def _heuristic(scenario: str, *, discrete: bool) -> Callable[[Tensor], Tensor] | None:
-    """A rule for a scenario, observations [*B, N, F] to actions; None if there is none."""
-    if scenario == "navigation":
-        return None if discrete else _keep_right
-    kind = getattr(importlib.import_module(f"vmas.scenarios.{scenario}"), "HeuristicPolicy", None)
+def _module_of(scenario: str) -> ModuleType:
+    """The module of VMAS that defines a scenario."""
+    module: ModuleType = importlib.import_module("vmas.scenarios").load(f"{scenario}.py")
+    return module
+
+
+def _heuristic(
+    scenario: str, observation: Tensor, limit: float, *, discrete: bool
+) -> Callable[[Tensor], Tensor] | None:
+    """VMAS' rule for a scenario, tried on observations; None if there is none for this kind of actions."""
+    kind = getattr(_module_of(scenario), "HeuristicPolicy", None)
     if kind is None:
         return None
     rule = kind(continuous_action=not discrete)
+
+    def act(observation: Tensor) -> Tensor:
+        action: Tensor = rule.compute_action(observation.flatten(0, -2), u_range=limit)
+        return action.unflatten(0, observation.shape[:-1])
+
     try:
-        rule.compute_action(torch.zeros(1, 128), u_range=1.0)
-    except AssertionError:  # a rule for the other kind of actions
+        act(observation)
+    except AssertionError:
         return None
     except Exception as error:
         raise InputError(f"env.scenario={scenario}: VMAS' heuristic cannot be used ({one_line(error)})") from error
-    return functools.partial(_compute, rule)
+    return act
 
 
-def _compute(rule: Any, observation: Tensor) -> Tensor:
-    """Apply a heuristic of VMAS to each robot."""
-    action: Tensor = rule.compute_action(observation.flatten(0, -2), u_range=1.0)
-    return action.unflatten(0, observation.shape[:-1])
-
-
-def _keep_right(observation: Tensor, reach: float = 0.4) -> Tensor:
+def keep_right(observation: Tensor, limit: float = 1.0, reach: float = 0.4) -> Tensor:
     """A rule for navigation, in which robots avoid each other: to the goal, away from and to the right of near robots.
 
     VMAS' own heuristic solves a quadratic program for each robot with cvxpylayers, and ignores the others.
 
     Args:
-        observation: position, velocity, offset from the goal, and more [*B, N, F].
+        observation: begins with position, velocity, and offset from the goal, [*B, N, F].
+        limit: largest component of a force.
         reach: distance at which robots begin to avoid each other, m.
 
     Returns:
-        accelerations [*B, N, 2].
+        forces [*B, N, 2].
     """
     position, velocity, offset = observation[..., :6].split(2, -1)
     apart = position.unsqueeze(-2) - position.unsqueeze(-3)
     distance = apart.norm(dim=-1, keepdim=True).clamp(min=1e-3)
-    away = apart / distance
+    away = apart / distance  # zero for the robot itself
     right = torch.stack((-away[..., 1], away[..., 0]), -1)
-    others = ~torch.eye(position.shape[-2], dtype=torch.bool, device=position.device).unsqueeze(-1)
-    force = (others * (reach / distance - 1).clamp(min=0) * (away + 0.5 * right)).sum(-2)
-    return (3 * force - 3 * offset - 4 * velocity).clamp(-1, 1)
+    evade = ((reach / distance - 1).clamp(min=0) * (away + 0.5 * right)).sum(-2)
+    return (3 * evade - 3 * offset - 4 * velocity).clamp(-limit, limit)
