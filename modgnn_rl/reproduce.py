@@ -6,7 +6,7 @@ import sys
 from datetime import datetime
 
 from modgnn_rl.cli.command import run_command
-from modgnn_rl.configs.schema import REFERENCE_SIZE, ReproduceConfig
+from modgnn_rl.configs.schema import ReproduceConfig
 from modgnn_rl.data.manifest import dataset_env_config
 from modgnn_rl.errors import InputError
 from modgnn_rl.reproduction.folder import claim_folder
@@ -21,11 +21,7 @@ def main(config: ReproduceConfig) -> int:
         python -m modgnn_rl.reproduce scale=small
         python -m modgnn_rl.reproduce scale=small study=communication seeds=3
     """
-    if config.env.sizes != [REFERENCE_SIZE] or REFERENCE_SIZE not in config.scale.sizes:
-        raise InputError(
-            f"env.num_agents={config.env.num_agents} must be {REFERENCE_SIZE}, as in the paper's training, and "
-            f"scale.sizes={config.scale.sizes} must contain {REFERENCE_SIZE}; add further sizes to scale.sizes"
-        )
+    check_request(config)
     dataset_env_config(config.env, config.scale.steps)
     folder = claim_folder(config)
     from modgnn_rl.reproduction.jobs import run_jobs
@@ -52,6 +48,24 @@ def main(config: ReproduceConfig) -> int:
     else:
         print(f"Next: python -m webbrowser {page.as_uri()}")
     return 1 if outcome.failures else 0
+
+
+def check_request(config: ReproduceConfig) -> None:
+    """Check the settings before the heavy imports.
+
+    Raises:
+        InputError: the paper's task with other numbers of agents than the paper's, or a study of settings that the task
+            does not have.
+    """
+    env, size = config.env, config.env.reference_size
+    if env.name == ReproduceConfig().env.name and (env.sizes != [size] or size not in config.scale.sizes):
+        raise InputError(
+            f"env.num_agents={env.num_agents} must be {size}, as in the paper's training, and "
+            f"scale.sizes={config.scale.sizes} must contain {size}; add further sizes to scale.sizes"
+        )
+    needed = {"range": "comm_range", "faults": "message_loss"}.get(config.study)
+    if needed is not None and not hasattr(env, needed):
+        raise InputError(f"study={config.study} varies env.{needed}, a setting that task '{env.name}' does not have")
 
 
 if __name__ == "__main__":

@@ -92,7 +92,7 @@ def _evaluate(
 
 def _figures(rollouts: EpisodeMetrics) -> Result:
     figures = {name: rollouts[name].double() for name in rollouts.values}
-    for name in SPREADS:
+    for name in SPREADS if set(SPREADS) <= set(rollouts.mean_squares) else ():
         squares = rollouts.mean_squares[name]
         figures[f"{name}_square"] = squares
         figures[f"{name}_spread"] = (squares - figures[name].square()).clamp(min=0).sqrt()
@@ -159,6 +159,8 @@ class Results:
 
     def __init__(self, outcome: JobResults, config: ReproduceConfig, study: Study) -> None:
         self.outcome, self.config, self.study = outcome, config, study
+        self.task = make_task(config.env)
+        self.references = list(self.task.reference_policies())
 
     def values(self, row: ModelVariant | str, setting: str, metric: str) -> NDArray[np.float64] | None:
         """Values of a metric [S, F] over seeds that did not fail and episodes; None where all failed.

@@ -39,7 +39,11 @@ def reproduction(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reproduction")
     config = ReproduceConfig(scale=TINY)
     study = Study(
-        "tables", [ModelVariant("gcn", 1), ModelVariant("gcn", 2), ModelVariant("central", 1)], [WORLD], TINY.updates
+        "tables",
+        [ModelVariant("gcn", 1), ModelVariant("gcn", 2), ModelVariant("central", 1)],
+        [WORLD],
+        TINY.updates,
+        32,
     )
     outcome = run_jobs(folder / "jobs", jobs_of(config, study, folder))
     assert not outcome.failures
@@ -49,7 +53,7 @@ def reproduction(tmp_path_factory):
 def test_models_trained_apart_see_the_same_batches_as_side_by_side(reproduction, tmp_path):
     """Else the rows of the tables, which are trained in groups, would not be comparable."""
     folder, config, _, outcome = reproduction
-    alone = Study("alone", [ModelVariant("gcn", 2)], [], TINY.updates)
+    alone = Study("alone", [ModelVariant("gcn", 2)], [], TINY.updates, 32)
     (tmp_path / "dataset").symlink_to(folder / "dataset")
     jobs = [job for job in jobs_of(config, alone, tmp_path) if "validation" not in job.name]
     apart = run_jobs(tmp_path / "jobs", jobs)
