@@ -75,13 +75,6 @@ def is_flocking(module: str) -> bool:
     return module.startswith("modgnn_rl.envs.flocking")
 
 
-# Parts that know a task by `modgnn_rl.task` alone.
-INDEPENDENT = ("trainers", "evaluation", "tracking", "visualization", "experiment", "models", "nn", "deploy", "task")
-
-# Modules in these parts that still import the flocking task, and what for. To shrink to nothing; never to grow.
-REMAINING: set[str] = set()
-
-
 def test_there_is_no_import_cycle_between_packages() -> None:
     graph: dict[str, set[str]] = {}
     for module in MODULES:
@@ -93,16 +86,11 @@ def test_there_is_no_import_cycle_between_packages() -> None:
         pytest.fail(f"packages import each other in a circle: {' -> '.join(reversed(error.args[1]))}")
 
 
-@pytest.mark.parametrize("part", INDEPENDENT)
-def test_the_flocking_task_is_imported_where_listed_only(part: str) -> None:
+def test_nothing_outside_envs_imports_the_flocking_task() -> None:
     found = {
-        module
-        for module in MODULES
-        if package(module) == f"modgnn_rl.{part}" and any(map(is_flocking, imports(module)))
+        module for module in MODULES if package(module) != "modgnn_rl.envs" and any(map(is_flocking, imports(module)))
     }
-    listed = {module for module in REMAINING if package(module) == f"modgnn_rl.{part}"}
-    assert found - listed == set(), "import modgnn_rl.task instead"
-    assert listed - found == set(), "remove these from REMAINING: they no longer import the flocking task"
+    assert found == set(), "import modgnn_rl.task instead"
 
 
 def test_settings_are_imported_from_the_schema() -> None:

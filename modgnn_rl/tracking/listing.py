@@ -16,12 +16,12 @@ __all__ = ["list_runs", "next_steps", "sort_key", "state_of"]
 
 ENDED_EARLY = ("stopped", "killed", "failed")
 LABELS = {"validation_loss": "loss"}
-LESS_IMPORTANT = ("speed", "age", "took", "leader", "best")  # columns to leave out if there is no room, in this order
+LESS_IMPORTANT = ("speed", "age", "took", "reward", "best")  # columns to leave out if there is no room, in this order
 SHORTEST_NAME = 24
 LEGEND = (
-    "took: training time; last: the trainer's objective in the last round (error on the policy's rollouts, m²/s², "
-    "validation loss, or reward per step); best: its best mean over 5 rounds; eval.: error in the evaluation, m²/s²; "
-    "leader: leader distance in the evaluation, m"
+    "took: training time; last: the trainer's objective in the last round (error on the policy's rollouts, validation "
+    "loss, or reward per step); best: its best mean over 5 rounds; eval., reward: error and reward in the "
+    "evaluation"
 )
 
 
@@ -36,6 +36,8 @@ def list_runs(runs: Sequence[RunSummary], width: int | None = None) -> str:
         return "No runs to list.\nNext: python -m modgnn_rl.train starts one"
     rows = [row for run in runs for row in (run, *run.policies)]
     columns = _columns({policy.path for run in runs for policy in run.policies})
+    if len({run.task for run in runs}) < 2:
+        del columns["task"]
     cells = {header: [header, *map(cell, rows)] for header, cell in columns.items()}
     if width is None:
         table = markdown(list(zip(*cells.values(), strict=True)))
@@ -110,13 +112,14 @@ def _columns(policies: Collection[object]) -> dict[str, Callable[[RunSummary], s
     now = datetime.now().astimezone()
     return {
         "run": lambda run: f"  {run.path.name}" if run.path in policies else run.name,
+        "task": shared(lambda run: run.task or "-"),
         "state": shared(state_of),
         "age": shared(lambda run: format_duration((now - run.updated).total_seconds() if run.updated else None)),
         "took": shared(lambda run: format_duration(run.seconds)),
         "last": _last_value,
         "best": lambda run: format_value(run.best),
         "eval.": lambda run: format_value(_evaluated(run, "error")),
-        "leader": lambda run: format_value(_evaluated(run, "leader_distance")),
+        "reward": lambda run: format_value(_evaluated(run, "reward")),
         "speed": shared(lambda run: f"{format_value(run.speed)} {run.unit}/s" if run.speed else "-"),
     }
 

@@ -235,7 +235,7 @@ def test_the_listed_evaluation_is_that_of_the_size_and_environment_of_training(t
             line.split("|") for line in list_runs([summarise_run(run.path)]).splitlines() if "--" not in line
         )
         cells = dict(zip(map(str.strip, header), map(str.strip, row), strict=True))
-        return [cells["eval."], cells["leader"]]
+        return [cells["eval."], cells["reward"]]
 
     write_evaluation(run, {"moment_force": 0.7}, changes="-wind=1")
     assert shown() == ["-", "-"]
