@@ -48,10 +48,11 @@ from modgnn_rl.errors import InputError
 from modgnn_rl.layout import Layout
 from modgnn_rl.nn.topology import as_matrix
 from modgnn_rl.registry import METRICS, TASKS
-from modgnn_rl.task_env import ACTION, EXPERT_ACTION, OBSERVATION, REWARD, ExpertLabels, Probe, TaskEnv, probe
-from modgnn_rl.visualization.recording import NO_MARKS, Frame
+from modgnn_rl.task_env import ACTION, EXPERT_ACTION, OBSERVATION, REWARD, Probe, TaskEnv, probe
+from modgnn_rl.task_expert import ExpertLabels
+from modgnn_rl.visualization.recording import NO_MARKS, Frame, edge_array
 
-__all__ = ["ACTION", "EXPERT_ACTION", "OBSERVATION", "REWARD", "CriticInput", "Task", "edge_array", "make_task"]
+__all__ = ["ACTION", "EXPERT_ACTION", "OBSERVATION", "REWARD", "CriticInput", "Task", "make_task"]
 
 
 class CriticInput(NamedTuple):
@@ -359,13 +360,6 @@ class Task:
     def __getstate__(self) -> dict[str, Any]:
         """What copies and other processes get: all but what follows from the expert."""
         return {name: value for name, value in vars(self).items() if name not in ("teacher", "metrics")}
-
-
-def edge_array(adjacency: Tensor) -> np.ndarray[Any, Any]:
-    """Receiver and sender of each edge, int64 [E, 2], of one flock's matrix [N, N], or padded list [2, E']."""
-    is_list = adjacency.dtype == torch.int64 and adjacency.shape[-2] == 2
-    edges = adjacency[:, adjacency[0] >= 0].flip(0).t() if is_list else adjacency.nonzero()
-    return edges.cpu().numpy()
 
 
 def _in_space(vectors: Tensor) -> np.ndarray[Any, Any]:

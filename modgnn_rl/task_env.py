@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
@@ -19,12 +18,13 @@ from torchrl.envs import EnvBase
 
 from modgnn_rl.actions import ActionSpace, Box, Discrete
 from modgnn_rl.errors import InputError, one_line
+from modgnn_rl.nn.keys import dotted
 from modgnn_rl.utils.tensors import pair_distances
 
 if TYPE_CHECKING:
     from modgnn_rl.task import Task
 
-__all__ = ["ACTION", "EXPERT_ACTION", "OBSERVATION", "REWARD", "ExpertLabels", "TaskEnv", "group_of", "probe"]
+__all__ = ["ACTION", "EXPERT_ACTION", "OBSERVATION", "REWARD", "Probe", "TaskEnv", "group_of", "probe"]
 
 OBSERVATION, ACTION, EXPERT_ACTION = ("agents", "observation"), ("agents", "action"), ("agents", "expert_action")
 CONTROLLED, REWARD = ("agents", "controlled"), ("agents", "reward")
@@ -69,12 +69,12 @@ def probe(task: Task, env: EnvBase) -> Probe:
     spec, key = env.full_observation_spec, _in_group(group, "observation")
     if key not in spec.keys(True, True):
         raise InputError(
-            f"task '{task.name}': the environment has no '{_dotted(key)}', only {_listed(spec)}; rename the observation"
+            f"task '{task.name}': the environment has no '{dotted(key)}', only {_listed(spec)}; rename the observation"
         )
     shape = spec[key].shape
     if len(shape) != 3:
         raise InputError(
-            f"task '{task.name}': '{_dotted(key)}' has shape {tuple(shape)}; expected [environments, agents, features]"
+            f"task '{task.name}': '{dotted(key)}' has shape {tuple(shape)}; expected [environments, agents, features]"
         )
     (action_key,) = env.action_keys
     action = env.full_action_spec_unbatched[action_key]
@@ -293,7 +293,7 @@ class TaskEnv(EnvBase):
         value = agents["observation"]
         if value.shape != expected.shape or value.dtype != expected.dtype:
             raise InputError(
-                f"task '{self.task.name}': '{_dotted(_in_group(self._group, 'observation'))}' has shape "
+                f"task '{self.task.name}': '{dotted(_in_group(self._group, 'observation'))}' has shape "
                 f"{tuple(value.shape)} and dtype {value.dtype}, but the environment's spec says "
                 f"{tuple(expected.shape)} and {expected.dtype}"
             )
@@ -345,62 +345,6 @@ class TaskEnv(EnvBase):
         super().close(**kwargs)
 
 
-class ExpertLabels(TensorDictModuleBase):
-    """A task's expert as the library uses it: it writes `EXPERT_ACTION` [*B, N, A].
-
-    Args:
-        expert: writes `EXPERT_ACTION` or `ACTION`, under ``agents`` or under the environment's own group.
-        task: says what actions are.
-
-    Raises:
-        InputError: the expert writes other keys, or, when it is called, actions of another shape.
-    """
-
-    def __init__(self, expert: TensorDictModuleBase, task: Task) -> None:
-        super().__init__()
-        self.expert, self._task = expert, task
-        names = {key: _last(key) for key in expert.out_keys}
-        self._key = next((key for name in ("expert_action", "action") for key in names if names[key] == name), None)
-        if self._key is None:
-            raise InputError(
-                f"task '{task.name}': the expert writes {', '.join(map(_dotted, expert.out_keys))}; expected "
-                f"'{_dotted(EXPERT_ACTION)}'"
-            )
-        keys = [unravel_key(key) for key in (*expert.in_keys, *expert.out_keys)]
-        groups = {key[0] for key in keys if isinstance(key, tuple)} - {"agents", "next"}
-        self._groups = groups if groups == {task.group_name} else set()
-        self.in_keys: list[Any] = [self._standard(key) for key in expert.in_keys]
-        self.out_keys: list[Any] = [EXPERT_ACTION, *(key for key in expert.out_keys if key != self._key)]
-
-    def _standard(self, key: NestedKey) -> NestedKey:
-        """The library's name of a key of the environment's group."""
-        return ("agents", *key[1:]) if isinstance(key, tuple) and key[0] in self._groups else key
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the expert's actions."""
-        data = tensordict.copy()
-        for group in self._groups:
-            data.set(group, data["agents"])
-        result = self.expert(data)
-        tensordict.set(EXPERT_ACTION, self._as_numbers(result[self._key], tensordict))
-        for key in self.out_keys[1:]:
-            tensordict.set(key, result[key])
-        return tensordict
-
-    def _as_numbers(self, action: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """The action as numbers [*B, N, A]; of discrete ones an index becomes one-hot."""
-        actions, observation = self._task.actions, tensordict[OBSERVATION]
-        agents = tuple(observation.shape[: tensordict.ndim + 1])
-        if isinstance(actions, Discrete) and not action.is_floating_point() and tuple(action.shape) == agents:
-            return torch.nn.functional.one_hot(action.long(), actions.width).to(observation.dtype)
-        if tuple(action.shape) != (*agents, actions.width):
-            raise InputError(
-                f"task '{self._task.name}': the expert writes '{_dotted(self._key)}' with shape {tuple(action.shape)}; "
-                f"expected {(*agents, actions.width)}"
-            )
-        return action.to(observation.dtype)
-
-
 def _in_group(group: str | None, name: str) -> NestedKey:
     return name if group is None else (group, name)
 
@@ -409,14 +353,6 @@ def _done_key(reset_key: NestedKey) -> NestedKey:
     return "done" if isinstance(reset_key, str) else (*reset_key[:-1], "done")
 
 
-def _last(key: NestedKey) -> str:
-    return key if isinstance(key, str) else str(key[-1])
-
-
-def _dotted(key: NestedKey) -> str:
-    return key if isinstance(key, str) else ".".join(map(str, key))
-
-
 def _listed(spec: Composite | Iterable[TensorSpec]) -> str:
     keys = spec.keys(True, True) if isinstance(spec, Composite) else spec
-    return ", ".join(_dotted(key) for key in keys)
+    return ", ".join(dotted(key) for key in keys)

@@ -6,8 +6,7 @@ import torch
 from tensordict import TensorDictBase
 
 from modgnn_rl.configs.schema import FlockingConfig
-from modgnn_rl.task import edge_array
-from modgnn_rl.visualization.recording import Frame
+from modgnn_rl.visualization.recording import Frame, edge_array
 
 __all__ = ["flock_frame"]
 

@@ -20,6 +20,7 @@ __all__ = [
     "Frame",
     "MetricSeries",
     "Recording",
+    "edge_array",
     "quantise",
     "range_flips",
     "recording_stride",
@@ -144,6 +145,13 @@ class Recording:
                 for name, series in self.metrics.items()
             },
         )
+
+
+def edge_array(adjacency: torch.Tensor) -> Array:
+    """Receiver and sender of each edge, int64 [E, 2], of one flock's matrix [N, N], or padded list [2, E']."""
+    is_list = adjacency.dtype == torch.int64 and adjacency.shape[-2] == 2
+    edges = adjacency[:, adjacency[0] >= 0].flip(0).t() if is_list else adjacency.nonzero()
+    return edges.cpu().numpy()
 
 
 def recording_stride(num_agents: int, steps: int, max_frames: int | None = None) -> int:

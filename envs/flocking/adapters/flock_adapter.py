@@ -15,8 +15,7 @@ from modgnn_rl.configs.schema import FlockingConfig
 from modgnn_rl.envs.flocking.env import FlockingEnv
 from modgnn_rl.envs.flocking.rendering.renderer import Renderer, check_render_mode
 from modgnn_rl.errors import InputError, suggestion
-from modgnn_rl.task import edge_array
-from modgnn_rl.visualization.recording import Frame
+from modgnn_rl.visualization.recording import Frame, edge_array
 
 __all__ = ["LARGEST", "FlockAdapter", "as_array"]
 
