@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from pathlib import Path
 from types import ModuleType
 
@@ -13,7 +14,11 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from modgnn_rl import TASKS, make_task
+from modgnn_rl.configs.schema import DAggerConfig, EvaluationConfig, TrainConfig
 from modgnn_rl.envs import FlockingEnv
+from modgnn_rl.evaluation.rollout import rollout
+from modgnn_rl.experiment.training import train
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -82,12 +87,19 @@ def test_the_loss_of_the_vmas_example_sees_the_messages_of_the_rollout():
         assert loss_module(rollouts)["kl_approx"].abs().max() > 1e-4  # the messages before the window count
 
 
-def test_a_policy_imitates_an_expert_of_ones_own_on_vmas():
+def test_own_task_hides_what_the_expert_knows_and_trains_by_its_name(monkeypatch, tmp_path):
     pytest.importorskip("vmas")
-    results = example("imitate_on_vmas").main(num_envs=16, num_agents=3, steps=30, rounds=3, updates=40)
-    (before, _), (after, _) = results["policy before"], results["policy"]
-    assert results["expert"][0] == 0
-    assert after < 0.4 * before
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    name = "own_task:BlindNavigation"
+    env = TASKS[name].option("settings")(name=name, num_agents=3, max_steps=30)
+    task = make_task(env)
+    results = rollout(task.reference_policies()["expert"], task, num_agents=3, num_flocks=4, steps=120, seed=0)
+    assert results["success"].all()
+    small = {"num_envs": 8, "steps_per_round": 20, "rounds": 2, "updates_per_round": 40, "batch_size": 32}
+    trainer = DAggerConfig(cloning_steps=20, cloning_updates=80, num_val_envs=2, ema_decay=0.9, **small)
+    run = train(TrainConfig(env=env, trainer=trainer, evaluation=EvaluationConfig(num_flocks=4), runs=str(tmp_path)))
+    rows = json.loads((run.path / "evaluation.json").read_text())["3"]["rows"]
+    assert rows["modgnn_mlp"]["error"]["mean"] < 0.7 * rows["zero action"]["error"]["mean"]
 
 
 @pytest.mark.parametrize(("schedule", "gate"), [("linear", "near"), ("exponential", "disagreement")])
