@@ -32,6 +32,9 @@ class PettingZooFlocking(ParallelEnv[str, dict[str, Array], Array]):
     receives from at this step, the leader first; ``neighbours`` [N, 6], their observations, zero for all others. Its
     action is a target velocity [3], m/s, and it has its own reward. The episodes of all agents end together.
 
+    What a policy for all agents at once reads, such as `modgnn_rl.ModGNN`, is in the infos of each agent:
+    ``observations`` [N, 6] and ``adjacency`` [N, N], the leader first.
+
     Args:
         num_agents: agents N, including the leader; at least 2.
         render_mode: see `GymnasiumFlocking`.
@@ -86,7 +89,7 @@ class PettingZooFlocking(ParallelEnv[str, dict[str, Array], Array]):
         """Start an episode; returns observations and infos. Options other than ``state`` are ignored."""
         data = self.flocks.reset(seed, {name: value for name, value in (options or {}).items() if name == "state"})
         self.agents = list(self.possible_agents)
-        return self._observe(data), {name: {} for name in self.agents}
+        return self._observe(data), self._infos(data)
 
     def step(
         self, actions: dict[str, Array]
@@ -99,11 +102,10 @@ class PettingZooFlocking(ParallelEnv[str, dict[str, Array], Array]):
             action[0, self._index(name)] = velocity
         data = self.flocks.step(action)
         rewards = data["agents", "reward"][0, :, 0].tolist()
-        agents, observations = self.agents, self._observe(data)
+        agents, observations, infos = self.agents, self._observe(data), self._infos(data)
         if bool(data["done"]):
             self.agents = []
         terminated, truncated = (dict.fromkeys(agents, bool(data[name])) for name in ("terminated", "truncated"))
-        infos: dict[str, dict[str, Any]] = {name: {} for name in agents}
         return observations, {name: rewards[self._index(name)] for name in agents}, terminated, truncated, infos
 
     def render(self) -> Array | None:
@@ -116,6 +118,11 @@ class PettingZooFlocking(ParallelEnv[str, dict[str, Array], Array]):
 
     def _index(self, name: str) -> int:
         return self.possible_agents.index(name) + 1
+
+    def _infos(self, data: TensorDictBase) -> dict[str, dict[str, Any]]:
+        """Observations and graph of the whole flock, for each agent."""
+        whole = {"observations": data["agents", "observation"][0], "adjacency": data["adjacency"][0]}
+        return {name: {key: as_array(value) for key, value in whole.items()} for name in self.agents}
 
     def _observe(self, data: TensorDictBase) -> dict[str, dict[str, Array]]:
         observation, adjacency = as_array(data["agents", "observation"][0]), as_array(data["adjacency"][0])

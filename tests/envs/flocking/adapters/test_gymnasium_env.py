@@ -12,8 +12,10 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import VectorEnv
 from pettingzoo.test import parallel_api_test
+from tensordict import TensorDict
 from torchrl.envs import GymEnv
 
+from modgnn_rl import make_model
 from modgnn_rl.envs import FlockingEnv
 from modgnn_rl.envs.flocking.adapters.pettingzoo_env import parallel_env
 from modgnn_rl.errors import InputError
@@ -189,3 +191,17 @@ def test_a_follower_follows_its_own_action() -> None:
 def test_flocks_without_followers_and_edge_lists_are_errors(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         parallel_env(**arguments)
+
+
+def test_a_policy_of_all_agents_acts_on_what_pettingzoo_infos_hold() -> None:
+    env, policy = parallel_env(5), make_model("gcn", seed=0)
+    _, infos = env.reset(seed=0)
+    for _ in range(2):
+        observation, adjacency = (torch.from_numpy(infos["agent_1"][key]) for key in ("observations", "adjacency"))
+        near = torch.cdist(observation[:, :3], observation[:, :3]) <= 3.5
+        assert torch.equal(adjacency.bool(), near.fill_diagonal_(False))
+        data = TensorDict({"agents": {"observation": observation}, "adjacency": adjacency.bool()}, [])
+        data["is_init"] = torch.ones(1, dtype=torch.bool)
+        action = policy(data)["agents", "action"].detach().numpy()
+        _, _, _, _, infos = env.step({name: action[index] for index, name in enumerate(env.possible_agents, 1)})
+    env.close()
